@@ -105,7 +105,7 @@ def test_a_scenario_with_a_death_is_written_and_read_again() -> None:
 def test_robots_die_in_groups_only() -> None:
     table: dict[str, Any] = scenario_table("paper-1")
     table["robot"][0]["dies"] = 3
-    with pytest.raises(BadScenario, match=r"robot\[0\]\.dies: robots die in groups only"):
+    with pytest.raises(BadScenario, match=r"robot\[0\]\.dies: robots die in groups and teams only"):
         validate(table, "it")
 
 

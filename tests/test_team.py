@@ -24,7 +24,8 @@ from compose.recording.ranging.run_ranges import ranges_of_run
 from compose.recording.run import of_frames, read
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_change import file_table
-from compose.scenario.scenario_file import load, parse, template_of
+from compose.scenario.scenario_file import load, parse, template_of, validate
+from compose.scenario.shipped_files import shipped
 from compose.sweep.trial import Trial, row
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Contact, Localised, NamedRange, Observation
@@ -179,6 +180,19 @@ def test_loss_delay_and_duplication_of_reports_change_ticks_only(seed: int) -> N
     assert audit_run(run).violations == ()
 
 
+def test_the_others_go_on_without_a_robot_that_dies_and_the_outcome_names_it(tmp_path: Path) -> None:
+    text = shipped()["relative"].read_text().replace('id = "b"', 'id = "b"\ndies = 4')
+    (tmp_path / "dead.toml").write_text(text)
+    out = tmp_path / "out"
+    ended = tandem_command("run", tmp_path / "dead.toml", "--in-process", "-q", "--no-export", "--out", out)
+    assert (ended.status, tandem_command("audit", out).status) == (1, 0), ended
+    summed = json.loads((out / "summary.json").read_text())
+    assert (summed["outcome"], summed["reason"]) == ("undecided", "b is dead from tick 4 on")
+    assert summed["team"] == {"not_localised": {"b": "it is dead from tick 4 on"}, "deaths": {"b": 4}}
+    assert [summed["robots"][robot]["localised"] for robot in "abc"] == [True, False, True]
+    assert validate(file_table(read(out).scenario), "again").scenario == read(out).scenario
+
+
 # --- reports -------------------------------------------------------------------------------------------
 
 DELIVERIES = st.lists(
@@ -321,7 +335,11 @@ DRAWN = "[team]\nrobots = 2\nside = 4.0\nanchors = 3\n"
         ({"robots": ALONE + "\nanchor = [0.0, 0.0]"}, "robot[0].anchor: it is not for robots that share"),
         ({"robots": ALONE + '\nattack = {kind = "shift", size = 1.0}'}, "robot[0].attack: it is not for"),
         ({"robots": TWO + '\npeer = "a"'}, "robot[1].peer: it is not for robots that share"),
-        ({"robots": ALONE + "\ndies = 4"}, "robot[0].dies: it is not for robots that share"),
+        (
+            {"robots": "", "anchors": DRAWN.replace("robots = 2", "robots = 1") + "dies = 3"},
+            "team.dies: it is",
+        ),
+        ({"robots": "", "anchors": DRAWN + "dies = [9, 3]"}, "team.dies: the lower bound 9 is above"),
         ({"robots": ALONE, "anchors": ""}, "robot: one robot alone needs at least two [[anchor]]"),
         ({"robots": TWO.replace('"b"', '"a"')}, "robot.id: 2 robots have the id 'a'"),
         (
@@ -356,6 +374,7 @@ def test_a_room_that_is_drawn_follows_from_its_seed() -> None:
     one, again = team("", DRAWN), team("", DRAWN)
     assert one == again
     other = parse(f'name = "team"\nseed = 2\n{MISSION}\n{DRAWN}', "team")
+    assert parse(f'name = "team"\nseed = 1\n{MISSION}\n{DRAWN}', "team", seed=2) == other
     assert other.team != one.team
     assert [robot.start for robot in other.robots] != [robot.start for robot in one.robots]
 
@@ -415,8 +434,12 @@ def test_a_trial_of_a_team_has_no_columns_of_pairs() -> None:
     scenario = load("room")
     found = row(Trial(0, 0, scenario, processes=False), run_mission(scenario), 1.0)
     assert (found.outcome, found.claims, found.claims_within) == ("localised", 2, 2)
-    assert (found.meeting_tick, found.orbiting_tick, found.group, found.robots["a"].bound_m) == (None,) * 4
+    assert (found.meeting_tick, found.orbiting_tick, found.robots["a"].bound_m) == (None,) * 3
     assert found.t_max_s == scenario.t_max
+    columns = found.group
+    assert columns is not None
+    assert (columns.bound_ticks, columns.honest_localised) == (round(scenario.t_max), 2)
+    assert (columns.honest_undecided, columns.honest_wrong, columns.attacker_met) == (0, 0, None)
 
 
 def test_the_python_api_has_the_ranges_to_all_anchors() -> None:

@@ -63,7 +63,18 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
         "versions": versions(),
         "robots": {robot: _robot_summary(run, robot) for robot in run.robots},
     }
-    return {**found, "group": _group(run)} if scenario.meetings else found
+    if scenario.in_pairs:
+        return found
+    return {**found, **({"group": _group(run) | _lost(run)} if scenario.meetings else {"team": _lost(run)})}
+
+
+def _lost(run: Run) -> dict[str, Any]:
+    """Return why each robot that is not localised is not, and the ticks from which on robots are dead."""
+    left = not_localised(run.scenario, run.verdicts(), run.length - 1)
+    return {
+        "not_localised": {robot: of_it(cause) for robot, cause in left.items()},
+        "deaths": {one.robot: one.tick for one in run.scenario.deaths},
+    }
 
 
 def _group(run: Run) -> dict[str, Any]:
@@ -71,15 +82,12 @@ def _group(run: Run) -> dict[str, Any]:
     meetings, searches = list(meeting_results(run)), list(search_results(run))
     results: list[MeetingResult | SearchResult] = [*meetings, *searches]
     ticks = [one.localised_tick for one in results]
-    left = not_localised(run.scenario, run.verdicts(), run.length - 1)
     return {
         "bound_s": max(one.bound_s for one in results),
         "bound_ticks": max(one.bound_ticks for one in results),
         "least_bound_s": run.scenario.least_bound,
         "localised_tick": max(tick for tick in ticks if tick is not None) if None not in ticks else None,
         "corrected_bounds": msgspec.to_builtins(list(corrected_bounds(run))),
-        "not_localised": {robot: of_it(cause) for robot, cause in left.items()},
-        "deaths": {one.robot: one.tick for one in run.scenario.deaths},
         "meetings": msgspec.to_builtins(meetings),
         **({"without_anchor": msgspec.to_builtins(searches)} if searches else {}),
     }

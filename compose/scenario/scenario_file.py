@@ -203,9 +203,8 @@ def template_of(table: Mapping[str, Any], faults: Sequence[str] = ()) -> Scenari
         raise BadScenario("missing field 'robot'")
     if file.group is not None and file.robot:
         raise BadScenario("group: its robots are drawn, so there can be no [[robot]]")
-    dies = file.group.dies if file.group is not None else None
-    if isinstance(dies, list) and dies[0] > dies[1]:
-        raise BadScenario(f"group.dies: the lower bound {dies[0]} is above the upper bound {dies[1]}")
+    if file.team is not None and (file.robot or file.anchor or file.group is not None):
+        raise BadScenario("team: its robots and anchors are drawn, so there can be no others")
     file = _with_robots(file)
     found = ScenarioTemplate(file, _scenario(file, faults), "", tuple(faults))
     with within("", BadScenario):
@@ -215,8 +214,10 @@ def template_of(table: Mapping[str, Any], faults: Sequence[str] = ()) -> Scenari
 
 def _with_robots(file: ScenarioFile) -> ScenarioFile:
     """Return `file` with the robots of its `[group]` or `[team]`, whose places are drawn from its seed."""
+    if file.team is not None:
+        return _with_death(with_team(file, file.team), file.team.dies)
     if file.group is None:
-        return with_team(file)
+        return file
     side = file.group.spacing * math.sqrt(file.group.robots)
     robots = []
     anchored = file.group.robots - file.group.without_anchor
@@ -224,14 +225,24 @@ def _with_robots(file: ScenarioFile) -> ScenarioFile:
         draw = random.Random(f"{file.seed}/anchor/r{i}").random
         robots.append(RobotTable(f"r{i}", (side * draw(), side * draw()) if i <= anchored else None))
     robots[0] = msgspec.structs.replace(robots[0], attack=file.group.attack)
-    dies = file.group.dies
-    if isinstance(dies, list):
-        dies = random.Random(f"{file.seed}/dies").randint(dies[0], dies[1])
-    robots[1] = msgspec.structs.replace(robots[1], dies=dies)
     area = file.mission.area or (0.0, 0.0, side, side)
-    return msgspec.structs.replace(
-        file, robot=robots, mission=msgspec.structs.replace(file.mission, area=area)
-    )
+    mission = msgspec.structs.replace(file.mission, area=area)
+    return _with_death(msgspec.structs.replace(file, robot=robots, mission=mission), file.group.dies)
+
+
+def _with_death(file: ScenarioFile, dies: int | list[int] | None) -> ScenarioFile:
+    """Return `file` with the tick from which on its second robot is dead, drawn from the seed if open."""
+    name = "group" if file.group is not None else "team"
+    if dies is None:
+        return file
+    if len(file.robot) < 2:
+        raise BadScenario(f"{name}.dies: it is that of the robot r2, and there is one robot only")
+    if isinstance(dies, list):
+        if dies[0] > dies[1]:
+            raise BadScenario(f"{name}.dies: the lower bound {dies[0]} is above the upper bound {dies[1]}")
+        dies = random.Random(f"{file.seed}/dies").randint(dies[0], dies[1])
+    dead = msgspec.structs.replace(file.robot[1], dies=dies)
+    return msgspec.structs.replace(file, robot=[file.robot[0], dead, *file.robot[2:]])
 
 
 def _with_profile(table: Mapping[str, Any]) -> Mapping[str, Any]:
@@ -319,7 +330,7 @@ def _placed(i: int, file: ScenarioFile, first: FirstMeeting, anchors: Mapping[st
             "the start, so part must be 'all'"
         )
     if robot.dies is not None and not in_group(file):
-        raise BadScenario(f"robot[{i}].dies: robots die in groups only")
+        raise BadScenario(f"robot[{i}].dies: robots die in groups and teams only")
     encounter = Pairing(first.peer, first.role, anchors[first.peer], first.rendezvous)
     return RobotSpec(robot.id, encounter, anchors.get(robot.id), start, robot.attack)
 

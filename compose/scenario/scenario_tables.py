@@ -103,8 +103,8 @@ class RobotTable(_Table, frozen=True):
     attack: Attack | None = None
     """False data injection: the falsification of the reports that this robot sends to its peer."""
     dies: Tick | None = None
-    """The tick from which on it is dead, in a group: it stands still, and measures, sends and receives
-    nothing."""
+    """The tick from which on it is dead, in a group or a team: it stands still, and measures, sends and
+    receives nothing."""
 
 
 class AnchorTable(_Table, frozen=True):
@@ -121,6 +121,10 @@ class AnchorTable(_Table, frozen=True):
     """The true x, y in m; None: at `position`, or drawn from the seed in `mission.area` without one."""
 
 
+DeathTick = Tick | Annotated[list[Tick], Meta(min_length=2, max_length=2)]
+"""A tick, or the bounds between which it is drawn, both included."""
+
+
 class TeamTable(_Table, frozen=True):
     """The `[team]` table: a room whose anchors and robots are drawn from the seed."""
 
@@ -132,6 +136,8 @@ class TeamTable(_Table, frozen=True):
     """The number m of anchors, which are A1 to Am; none with `mission.frame`."""
     unknown: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
     """The number of anchors whose position the robots do not know, the last ones."""
+    dies: DeathTick | None = None
+    """The tick from which on the robot r2 is dead, or the bounds between which it is drawn, both included."""
 
 
 class GroupTable(_Table, frozen=True):
@@ -145,7 +151,7 @@ class GroupTable(_Table, frozen=True):
     """The number of robots without an anchor, the last ones. By default, `mission.area` is the square."""
     attack: Attack | None = None
     """False data injection by the robot r1."""
-    dies: Tick | Annotated[list[Tick], Meta(min_length=2, max_length=2)] | None = None
+    dies: DeathTick | None = None
     """The tick from which on the robot r2 is dead, or the bounds between which it is drawn, both included."""
 
 
@@ -160,7 +166,7 @@ class ScenarioFile(_Table, frozen=True):
     """The name of the scenario, and the beginning of the names of its runs."""
     mission: MissionTable
     """The `[mission]` table."""
-    robot: Annotated[list[RobotTable], Meta(min_length=1, max_length=MAX_ROBOTS)] = []
+    robot: Annotated[list[RobotTable], Meta(max_length=MAX_ROBOTS)] = []
     """One `[[robot]]` for each robot; required without `[group]` and `[team]`."""
     group: GroupTable | None = None
     """The `[group]` table."""

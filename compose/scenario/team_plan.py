@@ -10,7 +10,7 @@ from msgspec.structs import replace
 
 from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
-from compose.scenario.scenario_tables import MAX_TEAM, AnchorTable, Area, RobotTable, ScenarioFile
+from compose.scenario.scenario_tables import MAX_TEAM, AnchorTable, Area, RobotTable, ScenarioFile, TeamTable
 from protocol.messages import TeamAnchor
 from protocol.mission import Anchor, Mission
 from protocol.motion import ORIGIN, TAU, Pose, relative, wrap
@@ -28,13 +28,8 @@ def is_team(file: ScenarioFile) -> bool:
     return bool(file.anchor) or file.team is not None or file.mission.frame is not None
 
 
-def with_team(file: ScenarioFile) -> ScenarioFile:
-    """Return `file` with the anchors and robots of its `[team]`, whose places are drawn from its seed."""
-    team = file.team
-    if team is None:
-        return file
-    if file.robot or file.anchor or file.group is not None:
-        raise BadScenario("team: its robots and anchors are drawn, so there can be no others")
+def with_team(file: ScenarioFile, team: TeamTable) -> ScenarioFile:
+    """Return `file` with the anchors and robots of its `team`, whose places are drawn from its seed."""
     if team.unknown > team.anchors:
         raise BadScenario(f"team.unknown: more than team.anchors = {team.anchors}")
     anchors = []
@@ -87,7 +82,7 @@ def _check(file: ScenarioFile) -> None:
     if len(file.robot) > MAX_TEAM:
         raise BadScenario(f"robot: {len(file.robot)} robots, and a team has at most {MAX_TEAM}")
     for i, robot in enumerate(file.robot):
-        for name in ("anchor", "peer", "attack", "dies"):
+        for name in ("anchor", "peer", "attack"):
             if getattr(robot, name) is not None:
                 raise BadScenario(f"robot[{i}].{name}: it is not for robots that share [[anchor]] or a frame")
     _check_mission(file)

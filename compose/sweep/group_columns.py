@@ -1,4 +1,4 @@
-"""The columns of a trial whose robots form a group: its bounds, and how its honest robots ended."""
+"""The columns of a trial whose robots form a group or a team: its bounds, and how honest robots ended."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import msgspec
 
 from compose.recording.claim_errors import Claim
 from compose.recording.corrected_bounds import corrected_bounds
-from compose.recording.group_localisation import meeting_results, search_results
+from compose.recording.group_localisation import TICK_ROUNDING, meeting_results, search_results
 from compose.recording.run import Run
 from compose.scenario.group_plan import least_makespan
 from compose.scenario.wake_up_tree import MeetingTimes
@@ -18,10 +18,10 @@ from world.scenario import Scenario
 
 
 class GroupColumns(msgspec.Struct, frozen=True, array_like=True):
-    """The columns of a row that only trials of groups have."""
+    """The columns of a row that only trials of groups and teams have."""
 
     bound_ticks: int
-    """the computed bound in ticks until all its robots are localised"""
+    """the computed bound in ticks until all its robots are localised; of a team, with exact sensors"""
     corrected_ticks: int | None
     """the last of the bounds that correct it, if a robot was late"""
     travel_ticks: float | None
@@ -43,9 +43,9 @@ class GroupColumns(msgspec.Struct, frozen=True, array_like=True):
 
 
 def group_columns(run: Run) -> GroupColumns | None:
-    """Return the columns of the group in `run`; None for pairs."""
+    """Return the columns of the group or team in `run`; None for pairs."""
     scenario = run.scenario
-    if not scenario.meetings:
+    if scenario.in_pairs:
         return None
     dead = {death.robot for death in scenario.deaths}
     honest = [robot.id for robot in scenario.robots if robot.attack is None and robot.id not in dead]
@@ -54,9 +54,10 @@ def group_columns(run: Run) -> GroupColumns | None:
     corrected = corrected_bounds(run)
     bounds = [one.bound_ticks for one in meeting_results(run)]
     bounds += [one.bound_ticks for one in search_results(run)]
-    met, found = _met_and_found(run, honest) if run.agents else (None, None)
+    team = math.ceil(scenario.t_max / scenario.mission.period - TICK_ROUNDING)
+    met, found = _met_and_found(run, honest) if run.agents and scenario.meetings else (None, None)
     return GroupColumns(
-        bound_ticks=max(bounds),
+        bound_ticks=max(bounds, default=team),
         corrected_ticks=corrected[-1].bound_ticks if corrected else None,
         travel_ticks=_travel_ticks(run),
         honest_tick=max([claim.tick for claim in claims.values()]) if len(claims) == len(honest) else None,
@@ -101,10 +102,15 @@ def _travel_ticks(run: Run) -> float | None:
 
     They are those of the plan, and end when they did; then robots travel from anchor to anchor, and meetings
     take no time. None if a first meeting has not localised both of its robots, if a robot dies, if one has no
-    anchor, or if claims need several meetings.
+    anchor, or if claims need several meetings; and in a team.
     """
     scenario = run.scenario
-    if scenario.deaths or scenario.planned_sweep is not None or scenario.confirmation is not None:
+    if (
+        not scenario.meetings
+        or scenario.deaths
+        or scenario.planned_sweep is not None
+        or scenario.confirmation is not None
+    ):
         return None
     place = {robot.id: i for i, robot in enumerate(scenario.robots)}
     hop = tuple(tuple(_way(scenario, i, j) for j in place.values()) for i in place.values())

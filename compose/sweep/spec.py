@@ -154,8 +154,14 @@ class Sweep(msgspec.Struct, frozen=True):
 
     @property
     def of_group(self) -> bool:
-        """True if its robots form a group."""
-        robots = self.base.get("robot")
+        """True if its robots form a group or a team."""
+        robots, mission = self.base.get("robot"), self.base.get("mission")
+        if (
+            self.base.get("anchor")
+            or "team" in self.base
+            or (isinstance(mission, dict) and "frame" in mission)
+        ):
+            return True
         if not isinstance(robots, list):
             return "group" in self.base
         return len(robots) > 2 and not any("peer" in robot for robot in robots if isinstance(robot, dict))
@@ -226,7 +232,7 @@ def validated(
         draws=draws,
     )
     if found.of_group and spec.starts is not None:
-        raise BadSpec(f"{source}: starts: the robots form a group, and its kinds are those of pairs")
+        raise BadSpec(f"{source}: starts: the robots form no pairs, and its kinds are those of pairs")
     return found
 
 

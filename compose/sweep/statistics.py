@@ -104,7 +104,7 @@ class SummaryColumn(NamedTuple):
     rank: int = -1
     """The larger it is, the earlier a table that is too wide lacks the column; -1 if another rule decides."""
     of_group: bool = False
-    """True if only sweeps of groups have the column."""
+    """True if only sweeps of groups and teams have the column."""
 
 
 def _outcome(name: str) -> SummaryColumn:
@@ -260,9 +260,9 @@ class CellSummary(msgspec.Struct, frozen=True):
     refused: str | None
     """reason why the scenario of this cell is infeasible"""
     bound_share_p50: Annotated[Number, _at(50, "bound_share", "share p50", ".2f", of_group=True)]
-    """only for groups: median over trials in which all honest robots claimed of honest_tick / bound_ticks"""
+    """not for pairs: median over trials in which all honest robots claimed of honest_tick / bound_ticks"""
     bound_share_max: Annotated[Number, _at(100, "bound_share", "share max", ".2f", of_group=True)]
-    """only for groups: the largest of these"""
+    """not for pairs: the largest of these"""
     corrected_share_max: Annotated[Number, _at(100, "corrected_share", "corrected", ".2f", of_group=True)]
     """only for groups: the largest honest_tick / corrected_ticks, of trials with a corrected bound"""
     makespan_p50: Annotated[Number, _at(50, "makespan", "travel p50", ".2f", of_group=True)]
@@ -270,11 +270,11 @@ class CellSummary(msgspec.Struct, frozen=True):
     makespan_p95: Annotated[Number, _at(95, "makespan", "travel p95", ".2f", of_group=True)]
     """only for groups: the 95th percentile of these"""
     honest_localised: Annotated[int | None, _of(_sum, "honest_localised", of_group=True)]
-    """only for groups: number of honest robots, of all trials, whose claims are right"""
+    """not for pairs: number of honest robots, of all trials, whose claims are right"""
     honest_undecided: Annotated[int | None, _of(_sum, "honest_undecided", of_group=True)]
-    """only for groups: number of those that have no claim at the end"""
+    """not for pairs: number of those that have no claim at the end"""
     honest_wrong: Annotated[int | None, _of(_sum, "honest_wrong", of_group=True)]
-    """only for groups: number of those whose claims are wrong"""
+    """not for pairs: number of those whose claims are wrong"""
     attacker_met: Annotated[int | None, _of(_sum, "attacker_met", of_group=True)]
     """only for groups: number of their meetings with a robot that has an attack, of audited trials"""
     attacker_found: Annotated[int | None, _of(_sum, "attacker_found", of_group=True)]

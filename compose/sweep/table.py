@@ -53,9 +53,10 @@ def _robots(cells: Sequence[Cell]) -> list[str]:
     """Return the ids of all robots in any cell. Malformed scenarios are skipped; they are rejected later."""
     ids: dict[str, None] = {}
     for cell in cells:
-        robots, group = cell.table.get("robot"), cell.table.get("group")
-        if isinstance(group, Mapping) and isinstance(number := group.get("robots"), int):
-            ids |= {f"r{i}": None for i in range(1, min(number, MAX_ROBOTS) + 1)}
+        robots = cell.table.get("robot")
+        for drawn in (cell.table.get("group"), cell.table.get("team")):
+            if isinstance(drawn, Mapping) and isinstance(number := drawn.get("robots"), int):
+                ids |= {f"r{i}": None for i in range(1, min(number, MAX_ROBOTS) + 1)}
         for robot in robots if isinstance(robots, list) else []:
             if isinstance(robot, Mapping) and isinstance(robot.get("id"), str):
                 ids[robot["id"]] = None
