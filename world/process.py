@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import ExitStack
 from typing import Any
@@ -90,7 +89,7 @@ class WorldProcess:
         """The robots with a liveliness token."""
         self._processes: dict[str, tuple[bytes, float]] = {}
         """The process that has the RobotConfig of each robot, and until when it is reserved for it."""
-        self._answered = time.monotonic()
+        self._answered = self._inbox.clock()
         """The time at which a robot last appeared, or sent a new answer."""
         self._late = 0
         """The number of discarded Commands of earlier ticks."""
@@ -121,7 +120,7 @@ class WorldProcess:
         self._check = session.LinkCheck(link) if replaceable else None
         run, inbox = self._run, self._inbox
         self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
-        self._link_deadline = time.monotonic() + self._link_timeout
+        self._link_deadline = self._inbox.clock() + self._link_timeout
         self._observation = {
             robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots
         }
@@ -143,7 +142,7 @@ class WorldProcess:
         end = simulation.mission_end
         expected = self._robots if end is not None else []
         if simulation.tick > 0 and self._period is not None:  # a resumed run does not wait for all robots
-            due = time.monotonic() + self._period
+            due = self._inbox.clock() + self._period
         try:
             while end is None:
                 commands = self._answers(simulation.observations(), due)
@@ -153,13 +152,13 @@ class WorldProcess:
                 if self._on_kill_point is not None:
                     self._on_kill_point("journal", simulation.tick)
                 end = simulation.advance(commands)
-                self._began = time.monotonic() if self._began is None else self._began
+                self._began = self._inbox.clock() if self._began is None else self._began
                 if self._period is not None:
-                    due = max((due or self._began) + self._period, time.monotonic())
+                    due = max((due or self._began) + self._period, self._inbox.clock())
         except NoAnswer as error:
             causes = (Cause("failed", text=str(error)),)
             end = simulation.end(MissionEnd(simulation.tick, "failed", causes))
-        self._ended = time.monotonic() if self._ended is None else self._ended
+        self._ended = self._inbox.clock() if self._ended is None else self._ended
         self.running_s = self._ended - self._began if self._began is not None else 0.0
         simulation.journal_final_reports(self._collect_final_reports(end, expected))
         self._print_missing_final_reports()
@@ -185,11 +184,11 @@ class WorldProcess:
             self._on_kill_point("report", tick)
         self._show_truth()
         commands: dict[str, Command] = {}
-        now = time.monotonic()
+        now = self._inbox.clock()
         self._repeat, self._repeat_to_all = now + REPEAT_S, now + REPEAT_TO_ALL_S
         while due is not None or len(commands) < len(self._robots):
             arrival = self._next((self._repeat if due is None else due) - now)
-            now = time.monotonic()
+            now = self._inbox.clock()
             if arrival.topic == "command":
                 command = self._answer(arrival)
                 if command is not None and command.robot not in commands:
@@ -231,18 +230,18 @@ class WorldProcess:
             self._observation[robot].put(encode(observation))
 
     def _next(self, timeout: float) -> Arrival:
-        now = time.monotonic()
+        now = self._inbox.clock()
         arrival = self._inbox.next(min(timeout, self._link_deadline - now))
         if arrival is not NO_ARRIVAL:
             self._link_deadline = now + self._link_timeout
             if self._check is not None and self._check.is_mute(now):
                 raise RobotsLinkLost
-        elif time.monotonic() >= self._link_deadline:
+        elif self._inbox.clock() >= self._link_deadline:
             raise RobotsLinkLost
         robot = arrival.source.robot
         if arrival.topic == "alive" and robot in self._robots:
             if robot not in self._alive:
-                self._answered = time.monotonic()
+                self._answered = self._inbox.clock()
             self._alive.add(robot)
             if robot in self._processes:
                 self._processes[robot] = self._processes[robot][0], math.inf
@@ -317,7 +316,7 @@ class WorldProcess:
             near = did_you_mean(robot, self._robots)
             return f"this world has no robot '{robot}'; it has {', '.join(self._robots)}{near}"
         if process:
-            now = time.monotonic()
+            now = self._inbox.clock()
             holder, until = self._processes.get(robot, (process, now))
             if holder != process and now < until:
                 return session.occupied(robot, self._run)
@@ -332,7 +331,7 @@ class WorldProcess:
         """
         frames = dict.fromkeys(self._robots, encode(end))
         received = self._final_reports = {**self._simulation.final_reports, **self._final_reports}
-        now = time.monotonic()
+        now = self._inbox.clock()
         began = self._ended or now
         self._repeat = self._repeat_to_all = now
         printed = False
@@ -357,7 +356,7 @@ class WorldProcess:
                     received[last.robot] = last
                 elif last is not None and last.tick <= end.tick:
                     self._latest[last.robot] = last.tick
-            now = time.monotonic()
+            now = self._inbox.clock()
 
 
 WORLD_POLL_S = 0.05
@@ -385,11 +384,11 @@ class WorldLinks:
         Raises CannotListen, NoRouter or Interrupted.
         """
         self._open.close()
-        give_up = time.monotonic() + self._timeout
+        give_up = self._inbox.clock() + self._timeout
         self.session: zenoh.Session | None = None
 
         def unanswered() -> None:
-            if time.monotonic() >= give_up:
+            if self._inbox.clock() >= give_up:
                 why = diagnosis.why(self.endpoints)
                 raise NoRouter(f"no router at {self.endpoints}; gave up after {self._timeout:g} s: {why}")
             self._inbox.next(WORLD_POLL_S)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from typing import Any
 
@@ -51,7 +50,7 @@ class AgentLink:
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
         self._token = self._show_alive()
         self._check = session.LinkCheck(link)
-        self._received_at = time.monotonic()
+        self._received_at = self._inbox.clock()
 
     def next(self, until: float) -> Arrival:
         """Return the next arrival, or NO_ARRIVAL once the monotonic clock reaches `until`.
@@ -59,12 +58,12 @@ class AgentLink:
         Raises WorldLinkLost if no Observation has arrived for too long, or if the session cannot send.
         """
         lost = self._received_at + self._link_timeout
-        arrival = self._inbox.next(min(until, lost) - time.monotonic())
+        arrival = self._inbox.next(min(until, lost) - self._inbox.clock())
         if arrival.topic == "observation":
-            self._received_at = time.monotonic()
+            self._received_at = self._inbox.clock()
             if self._check.is_mute(self._received_at):
                 raise WorldLinkLost
-        elif arrival is NO_ARRIVAL and time.monotonic() >= lost:
+        elif arrival is NO_ARRIVAL and self._inbox.clock() >= lost:
             raise WorldLinkLost
         return arrival
 

@@ -9,7 +9,6 @@ arrives is replaced by a new one.
 
 from __future__ import annotations
 
-import time
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -75,7 +74,7 @@ class AgentProcess:
         self._tick_s = config.tick_s
         self._world_timeout = timeout + (self._tick_s or 0.0)
         """The longest time in s between two new frames from the world."""
-        self._give_up = time.monotonic() + self._world_timeout
+        self._give_up = self._inbox.clock() + self._world_timeout
         self._on_kill_point = on_kill_point
         self._robot = memory.robot
         self._observation = memory.observation
@@ -124,7 +123,7 @@ class AgentProcess:
                     elif isinstance(message, TickStart) or (
                         isinstance(message, Observation) and self._on_observation(message, arrival.frame)
                     ):
-                        self._give_up = time.monotonic() + self._world_timeout
+                        self._give_up = self._inbox.clock() + self._world_timeout
                 case "report" if arrival.source.robot not in self._others:
                     self._inbox.refuse(arrival, "its sender is not in this mission")
                 case "report":
@@ -172,12 +171,12 @@ class AgentProcess:
 
         Raises WorldLinkLost if nothing arrives from the world for too long.
         """
-        if self._repeat_at is not None and time.monotonic() >= self._repeat_at:
+        if self._repeat_at is not None and self._inbox.clock() >= self._repeat_at:
             self._repeat_answers()
         return self._link.next(min(until or self._give_up, self._give_up, self._repeat_at or self._give_up))
 
     def _check_timeout(self) -> None:
-        if time.monotonic() > self._give_up:
+        if self._inbox.clock() > self._give_up:
             raise NoWorld(f"nothing received from the world for {self._world_timeout:g} s")
 
     @property
@@ -226,7 +225,7 @@ class AgentProcess:
     def _set_due(self) -> None:
         if self._tick_s is not None and self._observation is not None:
             hardware_mode = any(contact.heard is None for contact in self._observation.contacts)
-            self._due = time.monotonic() + (FIELD_SHARE if hardware_mode else REPORT_SHARE) * self._tick_s
+            self._due = self._inbox.clock() + (FIELD_SHARE if hardware_mode else REPORT_SHARE) * self._tick_s
 
     # --- answers ---
 
@@ -244,7 +243,7 @@ class AgentProcess:
                 framed = self._report_buffer.of(peer, tick)
                 if framed is not None:
                     received.append(framed)
-                elif self._due is None or time.monotonic() < self._due:
+                elif self._due is None or self._inbox.clock() < self._due:
                     return
                 else:
                     missed.append(peer)
@@ -276,7 +275,7 @@ class AgentProcess:
 
         In contact these include earlier reports.
         """
-        now = time.monotonic()
+        now = self._inbox.clock()
         if now < self._repeated_at + AGAIN_S:
             self._repeat_at = self._repeated_at + AGAIN_S
             return
@@ -303,7 +302,7 @@ class AgentProcess:
             frames_refused=self._inbox.refused.total(),
         )
         self.end = end
-        self._give_up = time.monotonic() + self._timeout
+        self._give_up = self._inbox.clock() + self._timeout
 
     def _answer_end(self, end: MissionEnd) -> MissionEnd:
         """Answer every repetition of the MissionEnd until the world confirms that it has the answer."""
@@ -312,7 +311,7 @@ class AgentProcess:
         self._link.command(frame)
         self._out_of_step.over()
         gone = False
-        while (now := time.monotonic()) < self._give_up:
+        while (now := self._inbox.clock()) < self._give_up:
             arrival = self._next(now + LAST_WORD_S if gone else None)
             if arrival.topic == "observation":
                 if arrival.frame == frame:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 
 from agent.process.discovery import NoWorld
@@ -64,7 +63,7 @@ class OutOfStep:
         Until then, the message is refused. In lockstep the world repeats one message. In real time its
         Observations advance.
         """
-        now = time.monotonic()
+        now = self._inbox.clock()
         advances = self._real_time and isinstance(message, Observation)
         if self._latest is None or not (message == self._latest[0] or advances):
             self._latest = message, now

@@ -20,7 +20,9 @@ SHELLS = ("bash", "zsh")
 VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     **dict.fromkeys(("file", "folder", "recording"), arguments.folder),
     **dict.fromkeys(("--anchors", "--config", "--keys", "--out"), arguments.folder),
-    **dict.fromkeys(("--accuracy", "--connect-timeout", "--rate", "--timeout"), arguments.positive),
+    **dict.fromkeys(
+        ("--accuracy", "--connect-timeout", "--minutes", "--rate", "--timeout"), arguments.positive
+    ),
     **dict.fromkeys(("id", "--robot", "--run"), arguments.name),
     "others": another_scenario,
     "planners": arguments.planner,
@@ -30,6 +32,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--confidence": arguments.confidence,
     "--days": arguments.up_to(36_500),
     "--format": FIGURE_FORMATS,
+    "--jobs": arguments.up_to(1000),
     "--kill": arguments.kill,
     "--model": arguments.model,
     "--only": PICTURES,
@@ -40,6 +43,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--print-trial": arguments.cell_and_trial,
     "--robots": arguments.names,
     "--scenario": arguments.source,
+    "--runs": arguments.up_to(10**9),
     "--schema": ("scenario", "sweep"),
     "--seed": arguments.natural,
     "--trials": arguments.up_to(10**7),
@@ -256,6 +260,18 @@ COMMANDS = (
         --seed S: seed of all missions, 0 to 2^63 - 1 [default: 0]
         --workers N: worker processes, 1 to 1000 [default: one per core]
         -q --quiet: print only the table
+        """,
+    ),
+    CommandEntry(
+        *("hunt", "Run", "Search for faults with which a mission breaks an invariant."),
+        *("tandem hunt random --minutes 5", "docs/howto-hunt.md"),
+        f"""{SCENARIO}
+        --minutes M = 5: wall time of the search in minutes [default: %(default)g]
+        | --runs N: number of runs instead, after which it ends
+        --jobs N: processes in which missions run, 1 to 1000 [default: one per core]
+        --seed N = 0: seed of all draws, 0 to 2^63 - 1 [default: %(default)s]
+        --out FILE: scenario file that is written if something is found [default: hunt-SCENARIO.toml]
+        -q --quiet: print only the results
         """,
     ),
     CommandEntry(

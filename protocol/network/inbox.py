@@ -131,6 +131,10 @@ class Inbox:
                 entry = topic, "other keys", why
             self._turned_away[entry] += 1
 
+    def clock(self) -> float:
+        """Return the time in s of the clock by which the owner waits, which does not go back."""
+        return time.monotonic()
+
     def next(self, timeout: float | None) -> Arrival:
         """Return the next event, or NO_ARRIVAL after `timeout` s. Raises Interrupted for the topic "stop"."""
         arrival = self._queued(timeout) if self._line is None else self._from(self._line, timeout)
@@ -140,12 +144,12 @@ class Inbox:
 
     def _queued(self, timeout: float | None) -> Arrival:
         """Return the next event of the queue, or NO_ARRIVAL after `timeout`. Raises Interrupted."""
-        until = time.monotonic() + timeout if timeout is not None else math.inf
+        until = self.clock() + timeout if timeout is not None else math.inf
         while True:
             try:
-                arrival = self._queue.get(timeout=min(max(until - time.monotonic(), 0.0), SIGNAL_S))
+                arrival = self._queue.get(timeout=min(max(until - self.clock(), 0.0), SIGNAL_S))
             except Empty:
-                if time.monotonic() >= until:
+                if self.clock() >= until:
                     return NO_ARRIVAL
             else:
                 break
@@ -157,19 +161,19 @@ class Inbox:
 
     def _from(self, line: Line, timeout: float | None) -> Arrival:
         """Return the next event of `line` or the queue, or NO_ARRIVAL after `timeout`. Raises Interrupted."""
-        until = time.monotonic() + timeout if timeout is not None else math.inf
+        until = self.clock() + timeout if timeout is not None else math.inf
         while True:
             idle = self._queue.empty()
             if idle or self._line_is_next:
                 self._line_is_next = False
-                wait = idle and time.monotonic() < until
+                wait = idle and self.clock() < until
                 if wait:
                     self._timer.set(until)
                 try:
                     arrival = line.receive(wait=wait)
                 except LineClosed:
                     self._line = None
-                    return self._queued(until - time.monotonic() if timeout is not None else None)
+                    return self._queued(until - self.clock() if timeout is not None else None)
                 if arrival is not None:
                     return arrival
             if not idle:
@@ -177,7 +181,7 @@ class Inbox:
                 return self._queued(0.0)
             if self._turned_away:
                 self._count_turned_away()
-            if time.monotonic() >= until:
+            if self.clock() >= until:
                 return NO_ARRIVAL
 
     def accepted(self, arrival: Arrival, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:

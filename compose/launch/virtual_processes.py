@@ -1,0 +1,397 @@
+"""A mission whose processes are threads of this one, over a network and a clock in memory.
+
+The world and the agents run as they do as processes, with files for journals. Exactly one of them runs at a
+time, and the clock only advances while all wait. So the same scenario and kills give the same order of
+events, and a wait of seconds takes none. A kill ends a thread where its process would have ended; what it has
+not written is lost.
+"""
+
+from __future__ import annotations
+
+import heapq
+import math
+import threading
+from collections import deque
+from collections.abc import Callable, Sequence
+from itertools import count
+from pathlib import Path
+from typing import Any, NamedTuple, cast
+
+import zenoh
+
+from agent.process.discovery import NoWorld
+from agent.process.link import WorldLinkLost
+from agent.process.node import AgentProcess
+from agent.process.recovery import Memory, remember
+from agent.process.robot import Robot
+from compose.launch.planner_loader import planner_of
+from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
+from compose.scenario.kills import WORLD, Kill
+from protocol.journal.journal_file import CorruptJournal, Journal
+from protocol.journal.resume import Retrace
+from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
+from world.process import WorldProcess
+from world.scenario import Scenario
+from world.simulation import Simulation, resumed
+
+RUN = "virtual"
+"""The name of the run."""
+LATENCY_S = 1e-4
+"""The time in s from the sending of a frame to its arrival."""
+NOTICE_S = 0.01
+"""The time in s until others see that a process has been killed."""
+VIRTUAL_START_S = 0.3
+"""The time in s that a process takes to start."""
+VIRTUAL_TIMEOUT_S = 30.0
+"""The time in s of the virtual clock that the processes wait for each other."""
+
+
+class Ended(NamedTuple):
+    """The end of a mission."""
+
+    kills: int
+    """The number of kills that took place."""
+    failures: tuple[str, ...]
+    """The errors with which processes ended, in their order."""
+
+
+class _Killed(BaseException):
+    """The end of a killed process. It is no Exception, so nothing but the end of its thread handles it."""
+
+
+class _Sample(NamedTuple):
+    """What a subscriber of Zenoh receives, as far as Tandem reads it."""
+
+    key_expr: str
+    payload: zenoh.ZBytes
+    kind: zenoh.SampleKind = zenoh.SampleKind.PUT
+    attachment: zenoh.ZBytes | None = None
+
+
+def run_mission(scenario: Scenario, folder: Path, kills: Sequence[Kill] = ()) -> Ended:
+    """Run `scenario`, write its journals to `folder`, and return how it ended. Killed processes restart."""
+    return _Network(scenario, folder, kills).run()
+
+
+class _Process:
+    """One process of the mission: a thread that runs only while the network waits for it."""
+
+    def __init__(self, network: _Network, name: str) -> None:
+        self.name = name
+        self.left = [kill for kill in network.kills if kill.who == name]
+        """The kills that have not taken place."""
+        self._network = network
+        self._turn = threading.Semaphore(0)
+        self._back = threading.Semaphore(0)
+        self._waits = 0
+        """The number of waits so far, so that the end of an earlier one does not wake it."""
+        self.link: _Link | None = None
+        """The session; None while the process does not run."""
+
+    def start(self) -> None:
+        """Start the process, and run it until it waits."""
+        self.link = _Link(self._network, self)
+        threading.Thread(target=self._main, daemon=True).start()
+        self._back.acquire()
+
+    def wait(self, until: float) -> None:
+        """Let others run until the clock reaches `until`, or an event arrives."""
+        self._waits += 1
+        if until < math.inf:
+            self._network.at(until, lambda waits=self._waits: self.wake(waits))  # type: ignore[misc]
+        self._back.release()
+        self._turn.acquire()
+        if self._network.over:
+            raise _Killed
+
+    def wake(self, waits: int | None = None) -> None:
+        """Run the process until it waits, if it is in its wait number `waits`, or in any if that is None."""
+        if self.link is not None and waits in (None, self._waits):
+            self._turn.release()
+            self._back.acquire()
+
+    def _main(self) -> None:
+        network = self._network
+        try:
+            (_world if self.name == WORLD else _agent)(network, self)
+        except _Killed:
+            if not network.over:
+                self._restart()
+        except Exception as error:  # noqa: BLE001  # a process ends with whatever its code raises
+            network.failures.append(f"{self.name}: {type(error).__name__}: {error}")
+        else:
+            network.ended.append(self.name)
+        finally:
+            network.close(self.link)
+            self.link = None
+            self._back.release()
+
+    def _restart(self) -> None:
+        kill = self.left.pop(0)
+        self._network.taken += 1
+        if kill.after is not None:
+            self._network.at(self._network.now + kill.after + VIRTUAL_START_S, self.start)
+
+    def on_kill_point(self, point: str, tick: int) -> None:
+        """Kill this process if that is scheduled for `point` of `tick`."""
+        for i, kill in enumerate(self.left):
+            if (kill.point, kill.tick) == (point, tick):
+                self.left.insert(0, self.left.pop(i))
+                raise _Killed
+
+
+class _Network:
+    """The clock, the events that are due, and the subscriptions of all processes."""
+
+    def __init__(self, scenario: Scenario, folder: Path, kills: Sequence[Kill]) -> None:
+        self.scenario, self.folder, self.kills = scenario, folder, kills
+        self.now = 0.0
+        self.over = False
+        self.taken = 0
+        self.failures: list[str] = []
+        self.ended: list[str] = []
+        self.subscribers: list[tuple[_Link, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
+        self.watchers: list[tuple[_Link, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
+        self.tokens: list[tuple[_Link, str]] = []
+        self._due: list[tuple[float, int, Callable[[], None]]] = []
+        self._number = count()
+        self._matching: dict[str, list[tuple[_Link, Callable[[_Sample], None]]]] = {}
+
+    def at(self, due: float, act: Callable[[], None]) -> None:
+        """Call `act` when the clock reaches `due`, after everything that was due by then before this call."""
+        heapq.heappush(self._due, (due, next(self._number), act))
+
+    def run(self) -> Ended:
+        """Run all processes until they have ended, or one has failed."""
+        processes = [_Process(self, name) for name in (WORLD, *[one.id for one in self.scenario.robots])]
+        for one in processes:
+            self.at(0.0, one.start)
+        while self._due and not self.failures and len(self.ended) < len(processes):
+            self.now, _, act = heapq.heappop(self._due)
+            act()
+        if not self._due and len(self.ended) < len(processes):
+            self.failures.append("a process that was killed is missing")
+        self.over = True
+        for one in processes:
+            one.wake()
+        return Ended(self.taken, tuple(self.failures))
+
+    def send(self, key: str, frame: bytes) -> None:
+        """Deliver `frame` to all subscribers of `key`, after LATENCY_S."""
+        if key not in self._matching:
+            one = zenoh.KeyExpr(key)
+            self._matching[key] = [(link, to) for link, keys, to in self.subscribers if keys.intersects(one)]
+        sample = _Sample(key, zenoh.ZBytes(frame))
+        for link, to in self._matching[key]:
+            self.deliver(link, to, sample, LATENCY_S)
+
+    def deliver(self, link: _Link, to: Callable[[_Sample], None], sample: _Sample, delay: float) -> None:
+        """Give `sample` to a subscriber of `link` after `delay` s, and let its process run."""
+
+        def arrive() -> None:
+            if link.process.link is link:
+                to(sample)
+                link.process.wake()
+
+        self.at(self.now + delay, arrive)
+
+    def subscribe(
+        self, link: _Link, key: str, to: Callable[[_Sample], None], *, tokens: bool = False
+    ) -> None:
+        """Let `to` receive what is sent on `key`, or the tokens there."""
+        (self.watchers if tokens else self.subscribers).append((link, zenoh.KeyExpr(key), to))
+        self._matching.clear()
+        for _, shown in list(self.tokens) if tokens else ():
+            if zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(shown)):
+                self.deliver(link, to, _Sample(shown, zenoh.ZBytes(b"")), LATENCY_S)
+
+    def show(self, link: _Link, key: str, *, gone: bool = False, delay: float = LATENCY_S) -> None:
+        """Show the liveliness token `key` of `link` to others, or withdraw it."""
+        self.tokens.remove((link, key)) if gone else self.tokens.append((link, key))
+        kind = zenoh.SampleKind.DELETE if gone else zenoh.SampleKind.PUT
+        for other, keys, to in self.watchers:
+            if keys.intersects(zenoh.KeyExpr(key)):
+                self.deliver(other, to, _Sample(key, zenoh.ZBytes(b""), kind), delay)
+
+    def close(self, link: _Link | None) -> None:
+        """Remove the subscriptions and tokens of `link`."""
+        self.subscribers = [one for one in self.subscribers if one[0] is not link]
+        self.watchers = [one for one in self.watchers if one[0] is not link]
+        self._matching.clear()
+        for one, key in [token for token in self.tokens if token[0] is link]:
+            self.show(one, key, gone=True, delay=NOTICE_S)
+
+
+class _Link:
+    """The part of a Zenoh session that `protocol/network/session.py` uses."""
+
+    def __init__(self, network: _Network, process: _Process) -> None:
+        self._network, self.process = network, process
+        self.info = self
+
+    def routers_zid(self) -> tuple[()]:
+        """Return no router: the link is not checked."""
+        return ()
+
+    def declare_publisher(self, key: str, **_: object) -> _Publisher:
+        """Return a publisher on `key`."""
+        return _Publisher(self._network, key)
+
+    def declare_subscriber(self, key: str, handler: Any) -> _Ring | None:
+        """Let `handler` receive the frames on `key`; return their queue if it is a channel."""
+        ring = _Ring() if isinstance(handler, zenoh.handlers.RingChannel) else None
+        self._network.subscribe(self, key, handler if ring is None else ring.append)
+        return ring
+
+    def declare_queryable(self, key: str, handler: object) -> None:
+        """Do nothing: agents have their configuration."""
+
+    def put(self, *_: object, **__: object) -> None:
+        """Do nothing: it ends a wait, and these waits end by themselves."""
+
+    def liveliness(self) -> _Liveliness:
+        """Return the tokens."""
+        return _Liveliness(self._network, self)
+
+
+class _Liveliness(NamedTuple):
+    """The liveliness tokens of a session."""
+
+    network: _Network
+    link: _Link
+
+    def declare_subscriber(self, key: str, handler: Callable[[_Sample], None], **_: object) -> None:
+        """Let `handler` receive the tokens on `key`."""
+        self.network.subscribe(self.link, key, handler, tokens=True)
+
+    def declare_token(self, key: str) -> _Token:
+        """Show the token `key`."""
+        self.network.show(self.link, key)
+        return _Token(self.network, self.link, key)
+
+
+class _Token(NamedTuple):
+    """A liveliness token."""
+
+    network: _Network
+    link: _Link
+    key: str
+
+    def undeclare(self) -> None:
+        """Withdraw it."""
+        self.network.show(self.link, self.key, gone=True)
+
+
+class _Publisher(NamedTuple):
+    """A publisher; it never has viewers."""
+
+    network: _Network
+    key: str
+    matching: bool = False
+
+    def put(self, frame: bytes) -> None:
+        """Send `frame`."""
+        self.network.send(self.key, frame)
+
+    def declare_matching_listener(self, handler: object) -> None:
+        """Do nothing: nothing changes."""
+
+    @property
+    def matching_status(self) -> _Publisher:
+        """Itself, whose `matching` says that there is no viewer."""
+        return self
+
+
+class _Ring(deque[_Sample]):
+    """A queue of received frames."""
+
+    def try_recv(self) -> _Sample | None:
+        """Return the next frame; None if there is none."""
+        return self.popleft() if self else None
+
+
+class _VirtualInbox(Inbox):
+    """An inbox whose waits last until the clock of the network."""
+
+    def __init__(self, network: _Network, process: _Process) -> None:
+        super().__init__(process.name)
+        self._network, self._process = network, process
+
+    def clock(self) -> float:
+        """Return the time of the network in s."""
+        return self._network.now
+
+    def next(self, timeout: float | None) -> Arrival:
+        """Return the next event, or NO_ARRIVAL after `timeout` s."""
+        until = self._network.now + timeout if timeout is not None else math.inf
+        while (arrival := super().next(0.0)) is NO_ARRIVAL and self._network.now < until:
+            self._process.wait(until)
+        return arrival
+
+    def say(self, line: str) -> None:
+        """Say nothing."""
+
+
+def _retraced(network: _Network, name: str) -> Retrace | None:
+    path = network.folder / name
+    return Retrace(path) if path.exists() else None
+
+
+def _agent(network: _Network, process: _Process) -> None:
+    """Run an agent from its journal to the end of the mission, as `tandem agent` does."""
+    old = _retraced(network, agent_journal(process.name))
+    config = network.scenario.config(process.name)
+    memory = remember(old, planner_of) if old is not None else None
+    if memory is not None and memory.config != config:
+        raise CorruptJournal("its configuration differs")
+    journal = (
+        old.open_for_append()[0] if old is not None else Journal(network.folder / agent_journal(process.name))
+    )
+    with journal:
+        if memory is None:
+            memory = Memory(config, Robot(config, planner_of(config), journal))
+        else:
+            memory.robot.append_to(journal)
+        agent = AgentProcess(
+            memory,
+            RUN,
+            _VirtualInbox(network, process),
+            timeout=VIRTUAL_TIMEOUT_S,
+            launched=True,
+            on_kill_point=process.on_kill_point,
+        )
+        while True:
+            agent.attach(cast(Any, process.link))
+            try:
+                agent.run()
+            except WorldLinkLost:
+                network.close(process.link)
+                process.link = _Link(network, process)
+            except NoWorld:
+                if agent.end is None:
+                    raise
+                return
+            else:
+                return
+
+
+def _world(network: _Network, process: _Process) -> None:
+    """Run the world from its journal to the end of the mission, as `tandem world` does."""
+    old = _retraced(network, WORLD_JOURNAL)
+    if old is None:
+        journal = Journal(network.folder / WORLD_JOURNAL)
+        simulation = Simulation(network.scenario, journal)
+    else:
+        simulation = resumed(network.scenario, old)
+        journal = old.open_for_append()[0]
+        simulation.append_to(journal)
+    with journal:
+        world = WorldProcess(
+            simulation,
+            RUN,
+            _VirtualInbox(network, process),
+            timeout=VIRTUAL_TIMEOUT_S,
+            on_kill_point=process.on_kill_point,
+        )
+        world.attach(cast(Any, process.link))
+        world.run()

@@ -1,0 +1,1 @@
+"""The hunt: a search for inputs of a mission with which an invariant does not hold."""

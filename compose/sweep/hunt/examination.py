@@ -1,0 +1,93 @@
+"""The examination of one input: its run, what that reaches, and the invariants that it breaks."""
+
+from __future__ import annotations
+
+import tempfile
+from pathlib import Path
+from typing import Any, cast
+
+import msgspec
+
+from compose.errors import UserError
+from compose.launch import in_process, virtual_processes
+from compose.recording.run import Run, of_frames
+from compose.scenario.kills import Kill
+from compose.scenario.scenario_file import validate
+from compose.sweep.hunt.coverage import WatchedPlanner, reached
+from compose.sweep.hunt.invariants import Breach, breaches
+from compose.sweep.hunt.mutation import Known
+from protocol.journal.journal_file import MemoryJournal, packed
+from protocol.wire import EncodedMessages
+from world.scenario import Scenario
+
+MOST_TICKS = 30_000
+"""The largest `max_ticks` of a mission, times its robots, that is run."""
+
+
+class Examined(msgspec.Struct, frozen=True):
+    """The result of one input."""
+
+    breaches: tuple[Breach, ...] = ()
+    reached: frozenset[str] = frozenset()
+    known: Known = Known(())
+    refused: str | None = None
+    """Why the input was not run; None if it was."""
+
+
+def scenario_of(table: dict[str, Any]) -> tuple[Scenario, tuple[Kill, ...]]:
+    """Return the scenario and the kills of `table`. Raises UserError."""
+    template = validate(table, "the input")
+    return template.scenario, template.kills(template.scenario.seed)
+
+
+def examined(table: dict[str, Any]) -> Examined:
+    """Run the input `table`, in one process and as virtual processes, and examine the run."""
+    try:
+        scenario, kills = scenario_of(table)
+    except UserError as error:
+        return Examined(refused=str(error))
+    if scenario.max_ticks * len(scenario.robots) > MOST_TICKS:
+        return Examined(refused="it could last too long")
+    seen: set[str] = set()
+    sinks, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
+    try:
+        in_process.played(
+            scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen)), messages.encode
+        )
+    except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
+        return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
+    run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
+    again = _again(scenario, kills, sinks)
+    found, moments = reached(run)
+    every = [*again, *breaches(run, replayed=not again)]
+    ids = tuple([one.id for one in scenario.robots])
+    found |= seen | {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
+    return Examined(tuple(every), frozenset(found), Known(ids, run.length - 1, moments))
+
+
+def _task(run: Run, kill: Kill) -> str:
+    """Return the task of the killed robot, or of the first one, in the tick of `kill`."""
+    robot = kill.who if kill.who in run.robots else run.robots[0]
+    command = run.command(robot, kill.tick) if kill.tick < run.length else None
+    return command.task if command is not None else "over"
+
+
+def _again(scenario: Scenario, kills: tuple[Kill, ...], sinks: dict[str, MemoryJournal]) -> list[Breach]:
+    """Return how a run as virtual processes differs from the journals in `sinks`."""
+    with tempfile.TemporaryDirectory(prefix="tandem-hunt-") as folder:
+        ended = virtual_processes.run_mission(scenario, Path(folder), kills)
+        if ended.failures:
+            return [Breach("a process dies", "; ".join(ended.failures))]
+        return [
+            Breach(
+                "the recording differs", f"{name}, from frame {_first(one.frames, Path(folder) / name)} on"
+            )
+            for name, one in sinks.items()
+            if (Path(folder) / name).read_bytes() != packed(one.frames)
+        ][:1]
+
+
+def _first(frames: list[bytes], path: Path) -> int:
+    """Return the number of the first frame of the journal at `path` that differs from `frames`."""
+    data = path.read_bytes()
+    return next((i for i in range(len(frames)) if not data.startswith(packed(frames[: i + 1]))), len(frames))

@@ -1,0 +1,146 @@
+"""The invariants of a run, beside the rules of the audit: what no input of a mission may break."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import msgspec
+import numpy as np
+
+from agent.estimation.claim import is_definite
+from compose.audit import agent_rules, rules
+from compose.recording.group_localisation import meeting_results, search_results
+from compose.recording.run import Run
+from compose.sweep.trial import Trial, row
+from protocol.messages import Inconsistent, Localised, Report
+from world.faults import Fault
+from world.referee import errors
+from world.scenario import Scenario
+
+TRUTH_M = 1e-5
+"""The distance in m, and in rad, within which a pose of exact sensors is the true one."""
+
+
+class Breach(msgspec.Struct, frozen=True):
+    """An invariant that does not hold."""
+
+    kind: str
+    """The invariant."""
+    what: str
+    """What was found, and where."""
+
+
+def breaches(run: Run, *, replayed: bool) -> Iterator[Breach]:
+    """Yield the invariants that do not hold in `run`, the rules of the audit included.
+
+    `replayed` is whether a second run of the same input has given the same bytes, which is what the rule
+    `decision` shows.
+    """
+    left = [one for one in rules.AUDIT_RULES if not (replayed and one is agent_rules.decision)]
+    for one in rules.audit_run(run, left).violations:
+        if one.rule != "claim" or _must_be_right(run.scenario):
+            yield Breach(f"audit: {one.rule}", one.line)
+    for check in (blamed, unfinished, late, truth_lost, forgotten, kept, indefinite):
+        yield from check(run)
+
+
+def _must_be_right(scenario: Scenario) -> bool:
+    """Return whether claims must be right: more attackers than are tolerated can mislead noisy robots."""
+    attackers = sum([one.attack is not None for one in scenario.robots])
+    return scenario.mission.noise.exact or attackers <= scenario.tolerates
+
+
+def _guaranteed(scenario: Scenario) -> bool:
+    """Return whether every robot must be localised in the end, and within the bounds."""
+    fair = all(one.let_through or one.ticks or one.contact_ticks for one in scenario.faults)
+    fair = fair and not any(one.partition and not (one.ticks or one.contact_ticks) for one in scenario.faults)
+    exact = scenario.mission.noise.exact and scenario.world_noise is None and scenario.range_model is None
+    honest = all(one.attack is None for one in scenario.robots) and not scenario.deaths
+    return fair and exact and honest and scenario.planner_name == "assured" and scenario.radio_model is None
+
+
+def blamed(run: Run) -> Iterator[Breach]:
+    """No robot finds an honest peer inconsistent."""
+    honest = {one.id for one in run.scenario.robots if one.attack is None}
+    for robot, agent in run.agents.items():
+        for step in agent.steps:
+            for contact, framed in zip(step.observation.contacts, step.reports, strict=False):
+                if contact.peer in honest and isinstance(verdict := framed.report.verdict, Inconsistent):
+                    what = f"tick {step.observation.tick}: {robot} finds {contact.peer} inconsistent"
+                    yield Breach("honest peer inconsistent", f"{what}: {verdict.claim}")
+                    return
+
+
+def unfinished(run: Run) -> Iterator[Breach]:
+    """Every robot is localised in the end, with exact sensors, honest peers and a radio that delivers."""
+    if run.end is None:
+        yield Breach("unfinished", "the mission has no end")
+    elif run.end.outcome != "localised" and _guaranteed(run.scenario):
+        yield Breach("unfinished", f"tick {run.end.tick}: {run.end.outcome}: {run.end.causes}")
+
+
+def late(run: Run) -> Iterator[Breach]:
+    """The computed bounds hold: of the meeting of a pair, of all meetings of a group, and of a team."""
+    scenario = run.scenario
+    if not _guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
+        return
+    if scenario.in_pairs:
+        found = row(Trial(0, 0, scenario, processes=False), run, 0.0)
+        met, orbiting, bound = found.meeting_tick, found.orbiting_tick, found.t_max_ticks
+        if met is not None and orbiting is not None and bound is not None and met - orbiting > bound:
+            yield Breach("bound", f"the robots meet {met - orbiting} ticks after both orbit, bound {bound}")
+    results = [(one.visited, one.localised_tick, one.bound_ticks) for one in meeting_results(run)]
+    results += [(one.robot, one.localised_tick, one.bound_ticks) for one in search_results(run)]
+    for robot, tick, bound in results:
+        if tick is None or tick > bound:
+            yield Breach("bound", f"{robot} is localised in tick {tick}, bound {bound}")
+
+
+def truth_lost(run: Run) -> Iterator[Breach]:
+    """With exact sensors and honest peers, the true pose is one of those that a robot considers possible."""
+    scenario = run.scenario
+    if not scenario.mission.noise.exact or any(one.attack is not None for one in scenario.robots):
+        return
+    for place, robot in enumerate(scenario.robots):
+        for estimate in run.estimates(robot.id):
+            truth = run.ticks[estimate.tick].truth.poses[place]
+            if estimate.world and not any(max(errors(one, truth)) < TRUTH_M for one in estimate.world):
+                what = f"tick {estimate.tick}: none of the {len(estimate.world)} poses of {robot.id} is true"
+                yield Breach("truth lost", what)
+                break
+
+
+def forgotten(run: Run) -> Iterator[Breach]:
+    """In a pair, no acknowledgement goes back, and nothing is sent from an earlier tick than before."""
+    for robot, agent in run.agents.items() if run.scenario.in_pairs else ():
+        before = (0, 0, 0, 0)
+        for step in agent.steps:
+            for framed in step.reports:
+                one: Report = framed.report
+                now = one.heard, one.ranges_heard, one.since, one.ranges_since
+                if any(a < b for a, b in zip(now, before, strict=True)) and one.verdict is None:
+                    yield Breach(
+                        "acknowledgement", f"tick {one.tick}: {robot} goes back from {before} to {now}"
+                    )
+                    return
+                before = now
+
+
+def kept(run: Run) -> Iterator[Breach]:
+    """The world keeps the claims that robots have made and not withdrawn, and no others."""
+    claims = {robot for robot, one in run.verdicts().items() if isinstance(one, Localised)}
+    dead = {one.robot for one in run.scenario.deaths}
+    for robot in run.robots:
+        if (robot in claims) != (run.standing_claim(robot) is not None) and robot not in dead:
+            yield Breach("withdrawn claim", f"{robot} {'has no' if robot in claims else 'has a'} claim")
+
+
+def indefinite(run: Run) -> Iterator[Breach]:
+    """Every covariance of a claim is positive definite, and finite."""
+    for robot, agent in run.agents.items():
+        for step in agent.steps:
+            verdict = step.command.verdict if step.command is not None else None
+            covariance = verdict.covariance if isinstance(verdict, Localised) else None
+            if covariance is not None and not is_definite(np.array(covariance.matrix)):
+                yield Breach("covariance", f"tick {step.observation.tick}: {robot}: {covariance}")
+                break

@@ -1,0 +1,317 @@
+"""The inputs of a hunt, which are scenario files as tables, and how one is made of another.
+
+Every function of MUTATIONS returns a changed copy of a table, or None if it has nothing to change. Ticks are
+drawn near the moments of the earlier run: those in which a robot began another task, met or claimed.
+"""
+
+from __future__ import annotations
+
+import copy
+import random
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any, get_args
+
+import msgspec
+
+from compose.launch.planner_loader import PLANNER_NAMES
+from compose.scenario.kills import DRAWN_VALUE, KILL_POINTS, WORLD
+from compose.scenario.scenario_file import scenario_table
+from compose.sweep import spec
+from compose.sweep.cells import cells
+from compose.sweep.draws import Draws, Heading, Place, StartsTable
+from protocol import attack
+
+Table = dict[str, Any]
+"""The content of a scenario file."""
+
+ROBOT_NAMES = ("a", "A", "b", "B", "aa", "a-b", "a_b", "r1", "r10", "R1", "0", "00", "World")
+"""Names of robots that something which compares them wrongly may confuse."""
+RANGE_SIGMAS = (0.001, 0.01, 0.05, 0.1)
+"""The sigmas in m of ranges that are drawn."""
+MOST_LISTED = 5
+"""The number of faults, and of kills, beyond which none is added."""
+CELLS_OF_SWEEP = 12
+"""The number of cells of each shipped sweep, evenly spread, from which the corpus begins."""
+
+
+class Known(msgspec.Struct, frozen=True):
+    """What an earlier run tells about where to change its input."""
+
+    robots: tuple[str, ...]
+    ticks: int = 50
+    """The number of ticks."""
+    moments: tuple[int, ...] = ()
+    """The ticks in which something changed."""
+
+    def tick(self, draw: random.Random) -> int:
+        """Return a tick near a moment, or any."""
+        if self.moments and draw.random() < 0.7:
+            return max(0, draw.choice(self.moments) + draw.choice((-1, 0, 0, 1)))
+        return draw.randrange(self.ticks + 1)
+
+
+def seeds(source: str) -> Iterator[Table]:
+    """Yield the inputs with which the hunt begins: `source`, then cells of the shipped sweeps of it."""
+    yield scenario_table(source)
+    for name in spec.shipped():
+        sweep = spec.load(name)
+        if sweep.base.get("name") != source:
+            continue
+        every = list(cells(sweep))
+        for cell in every[:: -(-len(every) // CELLS_OF_SWEEP)]:
+            yield copy.deepcopy(dict(cell.table))
+
+
+def mutated(table: Mapping[str, Any], known: Known, other: Mapping[str, Any], draw: random.Random) -> Table:
+    """Return `table` with one to three changes; `other` is an input of which parts may be taken."""
+    found = copy.deepcopy(dict(table))
+    for _ in range(draw.choice((1, 1, 2, 3))):
+        [change] = draw.choices(list(MUTATIONS), list(MUTATIONS.values()))
+        found = change(copy.deepcopy(found), known, draw) or found
+    if draw.random() < 0.1:
+        part = draw.choice(("fault", "kill", "seed"))
+        if part in other:
+            found[part] = copy.deepcopy(other[part])
+    return found
+
+
+def _seed(table: Table, _known: Known, draw: random.Random) -> Table:
+    return {**table, "seed": draw.getrandbits(31)}
+
+
+def _start(table: Table, _known: Known, draw: random.Random) -> Table | None:
+    """Draw the start of a robot, special places and headings included."""
+    robots = table.get("robot", [])
+    if not robots or any("anchor" not in one for one in robots):
+        return None
+    kinds = StartsTable((draw.choice(get_args(Place)),), (draw.choice(get_args(Heading)),))
+    drawn = Draws(starts=kinds).table(table, draw.getrandbits(31))["robot"]
+    chosen = draw.randrange(len(robots))
+    for i, robot in enumerate(robots):
+        if i == chosen or draw.random() < 0.5:
+            robot["start"] = drawn[i]["start"]
+    return table
+
+
+def _fault(table: Table, known: Known, draw: random.Random) -> Table | None:
+    """Add a fault of the radio, mostly of a few ticks."""
+    if len(table.get("fault", [])) >= MOST_LISTED:
+        return None
+    one, other = draw.sample(known.robots, 2) if len(known.robots) > 1 else (known.robots * 2)[:2]
+    fault: Table = {"link": draw.choice((f"{one}->{other}", f"{one}<->{other}", "*"))}
+    low = draw.randrange(8)
+    fault |= draw.choice(
+        [
+            {"loss": draw.choice((0.2, 0.5, 0.9))},
+            {"burst_start": 0.2, "burst_end": 0.2},
+            {"delay": [low, low + draw.randrange(12)]},
+            {"duplicate": 0.7, "delay": [0, low]},
+            {"reorder": 0.5},
+            {"corrupt": 0.4},
+            {"reports_per_tick": draw.choice((0.3, 0.7))},
+            {"partition": True},
+        ]
+    )
+    if "partition" in fault or draw.random() < 0.6:
+        first, kind = known.tick(draw), draw.choice(("ticks", "contact_ticks"))
+        first = min(first, draw.randrange(20)) if kind == "contact_ticks" else first
+        fault[kind] = [first, first + draw.choice((1, 2, 5, 10, 30))]
+    table.setdefault("fault", []).append(fault)
+    return table
+
+
+def _kill(table: Table, known: Known, draw: random.Random) -> Table | None:
+    """Add a kill of a process, or of several in one tick."""
+    if len(table.get("kill", [])) >= MOST_LISTED:
+        return None
+    anyone = [*known.robots, WORLD]
+    who: Any = draw.choice(anyone) if draw.random() < 0.8 else draw.sample(anyone, 2)
+    kill = {"who": who, "tick": known.tick(draw), "point": draw.choice((*KILL_POINTS, DRAWN_VALUE))}
+    if draw.random() < 0.4:
+        kill["after"] = draw.choice((0.5, 1.5, 4.0))
+    table.setdefault("kill", []).append(kill)
+    return table
+
+
+def _attack(table: Table, _known: Known, draw: random.Random) -> Table | None:
+    """Let a robot report false data."""
+    kind = draw.choice(get_args(attack.Kind))
+    part = "all" if kind in attack.OF_THE_START else draw.choice(get_args(attack.Part))
+    size = draw.choice((0.01, 0.1, 0.3, 1.0)) if kind != "scale" else draw.choice((0.5, 0.99, 1.01))
+    false = {"kind": kind, "size": size, "part": part}
+    if "group" in table:
+        table["group"]["attack"] = false
+    elif any("anchor" in one for one in table.get("robot", [])):
+        draw.choice([one for one in table["robot"] if "anchor" in one])["attack"] = false
+    else:
+        return None
+    return table
+
+
+def _death(table: Table, known: Known, draw: random.Random) -> Table | None:
+    """Let a robot of a group die."""
+    if "group" in table:
+        table["group"]["dies"] = known.tick(draw)
+    elif len(table.get("robot", [])) > 2:
+        draw.choice(table["robot"])["dies"] = known.tick(draw)
+    else:
+        return None
+    return table
+
+
+def _noise(table: Table, _known: Known, draw: random.Random) -> Table:
+    """Give all sensors other noise, which the robots are told."""
+    sigma = draw.choice(RANGE_SIGMAS)
+    noise: Table = {"anchor_sigma": sigma, "mutual_sigma": sigma}
+    if draw.random() < 0.5:
+        noise |= {"outliers": draw.choice((0.05, 0.2)), "mutual_dropout": draw.choice((0.0, 0.2))}
+    if draw.random() < 0.5:
+        noise |= {name: {"v": 0.001, "omega": 0.001} for name in ("actuation", "odometry")}
+    table["mission"] |= {"noise": noise, "accuracy": max(0.1, 2.0 * sigma)}
+    return table
+
+
+def _planner(table: Table, _known: Known, draw: random.Random) -> Table:
+    return {**table, "planner": {"name": draw.choice(PLANNER_NAMES)}}
+
+
+def _names(table: Table, _known: Known, draw: random.Random) -> Table | None:
+    """Give the robots other names."""
+    robots = table.get("robot", [])
+    if not 2 <= len(robots) <= len(ROBOT_NAMES):
+        return None
+    names = dict(zip([one["id"] for one in robots], draw.sample(ROBOT_NAMES, len(robots)), strict=True))
+    for robot in robots:
+        robot |= {name: names[robot[name]] for name in ("id", "peer") if name in robot}
+    for kill in table.get("kill", []):
+        who = kill.get("who", DRAWN_VALUE)
+        kill["who"] = [names.get(one, one) for one in who] if isinstance(who, list) else names.get(who, who)
+    table["fault"] = [one for one in table.get("fault", []) if one.get("link", "*") == "*"]
+    return table
+
+
+def _geometry(table: Table, _known: Known, draw: random.Random) -> Table:
+    """Change one length, speed or time of the mission, or where the anchors are."""
+    mission, factor = table["mission"], draw.choice((0.3, 0.7, 0.9, 1.1, 1.5, 3.0))
+    anchored = [one for one in table.get("robot", []) if "anchor" in one]
+    match draw.choice(("anchor", "area", "period", "max_speed", "max_turn_rate", "sensing_range", "safety")):
+        case "anchor" if anchored:
+            one = draw.choice(anchored)
+            x, y = one["anchor"]
+            one["anchor"] = [x * factor, y * factor + draw.choice((0.0, 0.0, 2.0))]
+            one.pop("start", None)
+        case "safety":
+            mission["safety_distance"] = draw.choice((0.0, 0.3, 0.8))
+        case "period" | "max_speed" | "max_turn_rate" | "sensing_range" as name:
+            mission[name] = mission[name] * factor
+        case _ if "group" in table:
+            table["group"]["spacing"] *= factor
+    return table
+
+
+def _size(table: Table, _known: Known, draw: random.Random) -> Table | None:
+    """Change the number of robots of a group, of those without an anchor, or of those that may be false."""
+    if "group" not in table:
+        return None
+    group = table["group"]
+    match draw.randrange(3):
+        case 0:
+            group["robots"] = draw.choice((3, 3, 4, 5))
+        case 1:
+            group["without_anchor"] = draw.choice((0, 1))
+        case _:
+            table["mission"]["tolerates"] = draw.choice((0, 1))
+    return table
+
+
+def _less(table: Table, _known: Known, draw: random.Random) -> Table | None:
+    """Leave something out."""
+    shorter = list(simpler(table))
+    return draw.choice(shorter) if shorter else None
+
+
+def _retimed(table: Table, known: Known, draw: random.Random) -> Table | None:
+    """Move a fault or a kill to another tick."""
+    listed = [*table.get("fault", []), *table.get("kill", [])]
+    if not listed:
+        return None
+    one, tick = draw.choice(listed), known.tick(draw)
+    if "who" in one:
+        one["tick"] = tick
+    elif "ticks" in one:
+        one["ticks"] = [tick, tick + one["ticks"][1] - one["ticks"][0]]
+    return table
+
+
+MUTATIONS: Mapping[Callable[[Table, Known, random.Random], Table | None], float] = {
+    _seed: 2.0,
+    _start: 2.0,
+    _fault: 3.0,
+    _kill: 3.0,
+    _attack: 1.0,
+    _death: 0.7,
+    _noise: 0.7,
+    _planner: 0.3,
+    _names: 0.7,
+    _geometry: 1.0,
+    _size: 1.0,
+    _less: 1.5,
+    _retimed: 1.5,
+}
+"""The changes of an input, and how often each is drawn."""
+
+
+def simpler(table: Mapping[str, Any]) -> Iterator[Table]:
+    """Yield `table` without one of its parts that are not needed, and with smaller ones in their place."""
+    for name in ("fault", "kill"):
+        for i in range(len(table.get(name, []))):
+            yield _with(table, name, [*table[name][:i], *table[name][i + 1 :]])
+    if table.get("group", {}).get("robots", 3) > 3:
+        yield _with(table, "group", "robots", table["group"]["robots"] - 1)
+    for way, fields in _dispensable(table):
+        place: Any = table
+        for step in way:
+            place = place[step]
+        for field in fields:
+            if field in place:
+                less = {key: value for key, value in place.items() if key != field}
+                yield _with(table, *way, less) if way else less
+
+
+def _dispensable(table: Mapping[str, Any]) -> Iterator[tuple[tuple[Any, ...], Iterable[str]]]:
+    """Yield the paths of the parts of `table`, each with its fields that may be left out."""
+    for name in ("fault", "kill"):
+        for i, one in enumerate(table.get(name, [])):
+            yield (name, i), sorted(one.keys() - {"link", "who", "tick"})
+    for i in range(len(table.get("robot", []))):
+        yield ("robot", i), ("attack", "dies")
+    if "group" in table:
+        yield ("group",), ("attack", "dies", "without_anchor")
+    yield ("mission",), ("noise", "tolerates", "safety_distance")
+    yield (), ("planner", "world", "max_ticks")
+
+
+def _with(table: Mapping[str, Any], *way: Any) -> Table:
+    """Return a copy of `table` with the last of `way` at the path of the others."""
+    found = copy.deepcopy(dict(table))
+    place: Any = found
+    for step in way[:-2]:
+        place = place[step]
+    place[way[-2]] = way[-1]
+    return found
+
+
+def fault_lines(table: Mapping[str, Any], source: Mapping[str, Any]) -> int:
+    """Return the number of faults, kills, attacks, deaths and other fields by which `table` differs."""
+    lists: Sequence[str] = ("fault", "kill")
+    count = sum([sum([one not in source.get(name, []) for one in table.get(name, [])]) for name in lists])
+    before = {one["id"]: one for one in source.get("robot", [])}
+    for robot in table.get("robot", []):
+        count += sum([robot[field] != before.get(robot["id"], {}).get(field) for field in robot])
+    for name in (table.keys() | source.keys()) - {*lists, "robot", "seed", "name"}:
+        one, other = table.get(name), source.get(name)
+        if isinstance(one, dict) and isinstance(other, dict):
+            count += sum([one.get(field) != other.get(field) for field in one.keys() | other.keys()])
+        else:
+            count += one != other
+    return count

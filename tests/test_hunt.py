@@ -1,0 +1,103 @@
+"""A hunt finds a planted defect, shrinks it to a file that runs, and finds nothing in what is right."""
+
+from __future__ import annotations
+
+import signal
+import tomllib
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agent.process.node import AgentProcess
+from compose.cli import hunt as command
+from compose.cli.main import parse
+from compose.launch import in_process, virtual_processes
+from compose.scenario.kills import KILL_POINTS
+from compose.scenario.kills import parse as kill
+from compose.scenario.scenario_file import load, scenario_table
+from compose.sweep.hunt.mutation import fault_lines
+from compose.sweep.hunt.search import Hunt
+from protocol.journal.journal_file import MemoryJournal, packed
+from protocol.messages import Observation
+from tests.commands import TandemProcess, tandem
+
+
+def ended_after(runs: int) -> Callable[[int], bool]:
+    return lambda done: done >= runs
+
+
+# --- virtual processes --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("point", KILL_POINTS)
+def test_virtual_processes_that_are_killed_write_the_recording_of_one_process(
+    point: str, tmp_path: Path
+) -> None:
+    mission = load("paper-1")
+    kills = [kill(f"{who}@{tick}:{point}") for who in ("a", "b", "world") for tick in (0, 42, 47)]
+    ended = virtual_processes.run_mission(mission, tmp_path, kills)
+    assert (ended.failures, ended.kills) == ((), 9 if point != "report" else 5)  # no Report without contact
+    journals = {name: MemoryJournal() for name in in_process.journals(mission)}
+    in_process.played(mission, journals)
+    assert {name: packed(one.frames) for name, one in journals.items()} == {
+        one.name: one.read_bytes() for one in tmp_path.iterdir()
+    }
+
+
+def test_a_virtual_process_that_is_not_started_again_is_missed(tmp_path: Path) -> None:
+    ended = virtual_processes.run_mission(load("paper-1"), tmp_path, [kill("b@5+never")])
+    assert (ended.kills, ended.failures) == (1, ("a process that was killed is missing",))
+
+
+# --- the search ---------------------------------------------------------------------------------------
+
+
+def test_a_hunt_reaches_the_same_with_any_number_of_jobs() -> None:
+    hunts = [Hunt("paper-1", 3, jobs) for jobs in (1, 2)]
+    assert [one.run(ended_after(32)) for one in hunts] == [None, None]
+    one, other = (hunt.reach() for hunt in hunts)
+    assert one == other
+    assert one.corpus > 3
+
+
+def steps_twice(real: Any) -> Any:
+    def on_observation(self: Any, observation: Observation, frame: bytes) -> bool:
+        if observation == self._observation and self._robot.state.task.name == "orbiting":
+            self._robot.observation(observation, frame)
+        return bool(real(self, observation, frame))
+
+    return on_observation
+
+
+def test_a_hunt_finds_a_defect_and_shrinks_its_input(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr(AgentProcess, "_on_observation", steps_twice(AgentProcess._on_observation))
+    monkeypatch.chdir(tmp_path)
+    assert command.main(parse(["hunt", "paper-2", "--runs", "200", "-q"])) == 1
+    text = (tmp_path / "hunt-paper-2.toml").read_text()
+    assert text.startswith("# the recording differs: agent-")
+    found = tomllib.loads(text)
+    assert len(found["kill"]) == 1
+    assert fault_lines(found, scenario_table("paper-2")) <= 2
+    monkeypatch.undo()
+    assert tandem("run", tmp_path / "hunt-paper-2.toml", "-q").status == 0  # without the defect
+
+
+# --- the command --------------------------------------------------------------------------------------
+
+
+def test_a_mistake_of_the_user_has_its_own_status(tmp_path: Path) -> None:
+    ended = tandem("hunt", "paper-3", cwd=tmp_path)
+    assert (ended.status, "paper-3: neither a file nor a shipped scenario" in ended.err) == (2, True)
+    (tmp_path / "hunt-paper-1.toml").touch()
+    assert tandem("hunt", "paper-1", cwd=tmp_path).status == 2
+
+
+def test_ctrl_c_ends_a_hunt_with_what_it_has_reached(tmp_path: Path) -> None:
+    with TandemProcess("hunt", "paper-1", "--minutes", "9", "--jobs", "1", cwd=tmp_path) as hunting:
+        hunting.until_prints("inputs to begin with")
+        hunting.tell(signal.SIGINT)
+        ended = hunting.ended()
+    assert ended.status == 130
+    assert "never reached, tasks:" in ended.out
