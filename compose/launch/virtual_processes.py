@@ -13,13 +13,14 @@ import math
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
+from functools import partial
 from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import zenoh
 
-from agent.process.discovery import NoWorld
 from agent.process.link import WorldLinkLost
 from agent.process.node import AgentProcess
 from agent.process.recovery import Memory, remember
@@ -27,7 +28,7 @@ from agent.process.robot import Robot
 from compose.launch.planner_loader import planner_of
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.scenario.kills import WORLD, Kill
-from protocol.journal.journal_file import CorruptJournal, Journal
+from protocol.journal.journal_file import Journal
 from protocol.journal.resume import Retrace
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from world.process import WorldProcess
@@ -132,7 +133,13 @@ class _Process:
         if kill.after is not None:
             self._network.at(self._network.now + kill.after + VIRTUAL_START_S, self.start)
 
-    def on_kill_point(self, point: str, tick: int) -> None:
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments that the world and the agents share."""
+        inbox = _VirtualInbox(self._network, self)
+        shared = {"timeout": VIRTUAL_TIMEOUT_S, "on_kill_point": self._on_kill_point}
+        return {"run": RUN, "inbox": inbox, **shared}
+
+    def _on_kill_point(self, point: str, tick: int) -> None:
         """Kill this process if that is scheduled for `point` of `tick`."""
         for i, kill in enumerate(self.left):
             if (kill.point, kill.tick) == (point, tick):
@@ -223,91 +230,52 @@ class _Network:
 
 
 class _Link:
-    """The part of a Zenoh session that `protocol/network/session.py` uses."""
+    """The part of a Zenoh session that `protocol/network/session.py` uses, without viewers and routers."""
 
     def __init__(self, network: _Network, process: _Process) -> None:
         self._network, self.process = network, process
-        self.info = self
+        self.info = SimpleNamespace(routers_zid=tuple)
 
-    def routers_zid(self) -> tuple[()]:
-        """Return no router: the link is not checked."""
-        return ()
-
-    def declare_publisher(self, key: str, **_: object) -> _Publisher:
+    def declare_publisher(self, key: str, **_: object) -> SimpleNamespace:
         """Return a publisher on `key`."""
-        return _Publisher(self._network, key)
+        return SimpleNamespace(
+            put=partial(self._network.send, key),
+            declare_matching_listener=_ignored,
+            matching_status=SimpleNamespace(matching=False),
+        )
 
-    def declare_subscriber(self, key: str, handler: Any) -> _Ring | None:
+    def declare_subscriber(self, key: str, handler: Any) -> SimpleNamespace | None:
         """Let `handler` receive the frames on `key`; return their queue if it is a channel."""
-        ring = _Ring() if isinstance(handler, zenoh.handlers.RingChannel) else None
-        self._network.subscribe(self, key, handler if ring is None else ring.append)
-        return ring
+        if not isinstance(handler, zenoh.handlers.RingChannel):
+            self._network.subscribe(self, key, handler)
+            return None
+        frames = deque[_Sample]()
+        self._network.subscribe(self, key, frames.append)
+        return SimpleNamespace(try_recv=lambda: frames.popleft() if frames else None)
 
     def declare_queryable(self, key: str, handler: object) -> None:
         """Do nothing: agents have their configuration."""
 
     def put(self, *_: object, **__: object) -> None:
-        """Do nothing: it ends a wait, and these waits end by themselves."""
+        """Do nothing: this would end a wait of Zenoh, and there is none."""
 
-    def liveliness(self) -> _Liveliness:
-        """Return the tokens."""
-        return _Liveliness(self._network, self)
+    def liveliness(self) -> SimpleNamespace:
+        """Return what declares and watches tokens."""
 
+        def declare_token(key: str) -> SimpleNamespace:
+            self._network.show(self, key)
+            return SimpleNamespace(undeclare=lambda: self._network.show(self, key, gone=True))
 
-class _Liveliness(NamedTuple):
-    """The liveliness tokens of a session."""
-
-    network: _Network
-    link: _Link
-
-    def declare_subscriber(self, key: str, handler: Callable[[_Sample], None], **_: object) -> None:
-        """Let `handler` receive the tokens on `key`."""
-        self.network.subscribe(self.link, key, handler, tokens=True)
-
-    def declare_token(self, key: str) -> _Token:
-        """Show the token `key`."""
-        self.network.show(self.link, key)
-        return _Token(self.network, self.link, key)
+        return SimpleNamespace(
+            declare_subscriber=lambda key, handler, history: self._network.subscribe(
+                self, key, handler, tokens=history
+            ),
+            declare_token=declare_token,
+        )
 
 
-class _Token(NamedTuple):
-    """A liveliness token."""
-
-    network: _Network
-    link: _Link
-    key: str
-
-    def undeclare(self) -> None:
-        """Withdraw it."""
-        self.network.show(self.link, self.key, gone=True)
-
-
-class _Publisher(NamedTuple):
-    """A publisher; it never has viewers."""
-
-    network: _Network
-    key: str
-    matching: bool = False
-
-    def put(self, frame: bytes) -> None:
-        """Send `frame`."""
-        self.network.send(self.key, frame)
-
-    def declare_matching_listener(self, handler: object) -> None:
-        """Do nothing: nothing changes."""
-
-    @property
-    def matching_status(self) -> _Publisher:
-        """Itself, whose `matching` says that there is no viewer."""
-        return self
-
-
-class _Ring(deque[_Sample]):
-    """A queue of received frames."""
-
-    def try_recv(self) -> _Sample | None:
-        """Return the next frame; None if there is none."""
-        return self.popleft() if self else None
+def _ignored(_: object) -> None:
+    """Do nothing."""
 
 
 class _VirtualInbox(Inbox):
@@ -332,34 +300,16 @@ class _VirtualInbox(Inbox):
         """Say nothing."""
 
 
-def _retraced(network: _Network, name: str) -> Retrace | None:
-    path = network.folder / name
-    return Retrace(path) if path.exists() else None
-
-
 def _agent(network: _Network, process: _Process) -> None:
     """Run an agent from its journal to the end of the mission, as `tandem agent` does."""
-    old = _retraced(network, agent_journal(process.name))
-    config = network.scenario.config(process.name)
+    path, config = network.folder / agent_journal(process.name), network.scenario.config(process.name)
+    old = Retrace(path) if path.exists() else None
     memory = remember(old, planner_of) if old is not None else None
-    if memory is not None and memory.config != config:
-        raise CorruptJournal("its configuration differs")
-    journal = (
-        old.open_for_append()[0] if old is not None else Journal(network.folder / agent_journal(process.name))
-    )
-    with journal:
+    with old.open_for_append()[0] if old is not None else Journal(path) as journal:
         if memory is None:
             memory = Memory(config, Robot(config, planner_of(config), journal))
-        else:
-            memory.robot.append_to(journal)
-        agent = AgentProcess(
-            memory,
-            RUN,
-            _VirtualInbox(network, process),
-            timeout=VIRTUAL_TIMEOUT_S,
-            launched=True,
-            on_kill_point=process.on_kill_point,
-        )
+        memory.robot.append_to(journal)
+        agent = AgentProcess(memory, launched=True, **process.arguments())
         while True:
             agent.attach(cast(Any, process.link))
             try:
@@ -367,31 +317,19 @@ def _agent(network: _Network, process: _Process) -> None:
             except WorldLinkLost:
                 network.close(process.link)
                 process.link = _Link(network, process)
-            except NoWorld:
-                if agent.end is None:
-                    raise
-                return
             else:
                 return
 
 
 def _world(network: _Network, process: _Process) -> None:
     """Run the world from its journal to the end of the mission, as `tandem world` does."""
-    old = _retraced(network, WORLD_JOURNAL)
-    if old is None:
-        journal = Journal(network.folder / WORLD_JOURNAL)
-        simulation = Simulation(network.scenario, journal)
-    else:
-        simulation = resumed(network.scenario, old)
-        journal = old.open_for_append()[0]
+    path = network.folder / WORLD_JOURNAL
+    old = Retrace(path) if path.exists() else None
+    simulation = resumed(network.scenario, old) if old is not None else None
+    with old.open_for_append()[0] if old is not None else Journal(path) as journal:
+        if simulation is None:
+            simulation = Simulation(network.scenario, journal)
         simulation.append_to(journal)
-    with journal:
-        world = WorldProcess(
-            simulation,
-            RUN,
-            _VirtualInbox(network, process),
-            timeout=VIRTUAL_TIMEOUT_S,
-            on_kill_point=process.on_kill_point,
-        )
+        world = WorldProcess(simulation, **process.arguments())
         world.attach(cast(Any, process.link))
         world.run()

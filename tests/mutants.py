@@ -1,0 +1,219 @@
+"""Defects that a hunt must find: `python -m tests.mutants [NAME ...] [--cpu S]`.
+
+Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used
+S seconds of processor time: with the guide, and beside it by chance alone. One line each says after how many
+seconds and runs it was found, and how small the input is.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import multiprocessing
+import os
+import sys
+import textwrap
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from agent.estimation import exact_estimator
+from agent.estimation.gaussian import odometry_noise, placement_guesses
+from agent.peer import peer_state
+from agent.planning import accuracy_seeking
+from agent.process import node
+from compose.recording import run
+from compose.scenario import group_meetings
+from compose.sweep.hunt.mutation import fault_lines
+from compose.sweep.hunt.search import Found, Hunt
+from protocol.journal.journal_file import Journal
+from world import scenario, tick
+
+BUDGET_S = 600.0
+"""The processor time in s of 5 minutes on two cores."""
+
+
+def edited(owner: Any, name: str, old: str, new: str) -> None:
+    """Replace `old`, which must be there, by `new` in the source of the function `name` of `owner`."""
+    function = vars(owner)[name]
+    source = textwrap.dedent(inspect.getsource(function))
+    assert source.count(old) == 1, source
+    namespace: dict[str, Any] = {}
+    exec(compile(source.replace(old, new), f"{name}, mutated", "exec"), function.__globals__, namespace)
+    setattr(owner, name, namespace[name])
+
+
+def unflushed() -> None:
+    """A Command of the last manoeuvre reaches the journal only with the next frame."""
+    write = Journal.write
+
+    def later(self: Journal, *frames: bytes) -> None:
+        held = getattr(self, "held", ())
+        is_command = len(frames) <= 3 and any(b"\xa7command" in one and b"last-man" in one for one in frames)
+        vars(self)["held"] = frames[-1:] if is_command else ()
+        write(self, *held, *(frames[:-1] if is_command else frames))
+
+    setattr(Journal, "write", later)  # noqa: B010
+
+
+def twice() -> None:
+    """A repeated Observation is taken again by a robot that waits."""
+    edited(
+        node.AgentProcess,
+        "_on_observation",
+        "        self._out_of_step.over()\n        self._repeat_answers()",
+        "        self._out_of_step.over()\n"
+        "        if self._robot.state.task.name == 'waiting' and self._robot.command is None:\n"
+        "            self._robot.observation(observation, frame)\n"
+        "        self._repeat_answers()",
+    )
+
+
+def back() -> None:
+    """An overtaken report takes acknowledgements back."""
+    edited(
+        peer_state,
+        "with_report",
+        "report.heard if latest else peer_state.acknowledged",
+        "report.heard",
+    )
+
+
+def early() -> None:
+    """A report that is delayed is used a tick early, if it is there."""
+    edited(
+        node.AgentProcess,
+        "_decide_when_reports_complete",
+        "for tick in listed:",
+        "for tick in (*listed, *[one for one in (now,) if one not in listed and contact.heard == ()"
+        " and self._report_buffer.of(peer, one)]):",
+    )
+
+
+def kept() -> None:
+    """The world keeps a claim that is withdrawn."""
+    edited(
+        tick,
+        "verdicts_after",
+        "if command is None or command.verdict == given",
+        "if command is None or command.verdict is None or command.verdict == given",
+    )
+    vars(run)["verdicts_after"] = tick.verdicts_after
+
+
+def lost() -> None:
+    """A hypothesis is lost when the peer is in range again."""
+    edited(
+        exact_estimator,
+        "_with_placements",
+        "    return replace(belief, placements=remaining",
+        "    if len(remaining) > 1 and [one.range is None for one in observations[-2:]] == [True, False]:\n"
+        "        remaining = remaining[1:]\n"
+        "    return replace(belief, placements=remaining",
+    )
+
+
+def bound() -> None:
+    """The bound of a group leaves out its last visit."""
+    edited(
+        group_meetings,
+        "group_meetings",
+        "one.ends) for one in meetings])",
+        "min(one.ends, meetings[-2].ends)) for one in meetings])",
+    )
+
+
+def clock() -> None:
+    """A retreat begins at the time of the clock, not at the tick."""
+    edited(
+        accuracy_seeking,
+        "_continue_phase3",
+        "0.0 - command.omega), state.tick))",
+        "0.0 - command.omega), __import__('time').monotonic_ns() % 1000))",
+    )
+
+
+def case() -> None:
+    """The ids of robots are compared without their case."""
+    edited(scenario.Scenario, "robot", "spec.id == robot", "spec.id.lower() == robot.lower()")
+
+
+def triangle() -> None:
+    """A covariance is not symmetrised."""
+    edited(odometry_noise, "symmetric", "both, both.mT", "both, 0.0")
+    vars(placement_guesses)["symmetric"] = odometry_noise.symmetric
+
+
+MUTANTS: dict[Callable[[], None], str] = {
+    unflushed: "random",
+    twice: "random",
+    back: "random",
+    early: "random",
+    kept: "random-group",
+    lost: "random",
+    bound: "random-group",
+    clock: "random",
+    case: "random",
+    triangle: "random",
+}
+"""The mutants, each with the scenario in which it is hunted."""
+
+
+def used() -> float:
+    """Return the processor time in s of the workers of this process."""
+    total = 0
+    for one in multiprocessing.active_children():
+        fields = Path(f"/proc/{one.pid}/stat").read_text().rpartition(")")[2].split()
+        total += int(fields[11]) + int(fields[12])
+    return total / os.sysconf("SC_CLK_TCK")
+
+
+def hunted(mutant: Callable[[], None], source: str, cpu_s: float, *, guided: bool) -> str:
+    """Plant `mutant` in this process, hunt, and return what was found."""
+    mutant()
+    hunt = Hunt(source, 1, 1, guided=guided)
+    spent = 0.0
+
+    def is_over(_: int) -> bool:
+        nonlocal spent
+        spent = used()
+        return spent > cpu_s
+
+    found: Found | None = hunt.run(is_over)
+    if found is None:
+        return f"not found in {hunt.runs} runs, {spent:.0f} s"
+    changes = fault_lines(found.table, hunt.seeds[0])
+    return f"found in run {found.runs}, after {spent:.0f} s; {changes} changes: {found.breach.kind}"
+
+
+def main(arguments: list[str]) -> int:
+    """Hunt the mutants, and return 0 if the guide has found at least nine of ten of them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("name", nargs="*")
+    parser.add_argument("--cpu", type=float, default=BUDGET_S)
+    parser.add_argument("--guided-only", action="store_true")
+    options = parser.parse_args(arguments)
+    chosen = {one: source for one, source in MUTANTS.items() if one.__name__ in (options.name or _names())}
+    missed = 0
+    for mutant, source in chosen.items():
+        for guided in (True,) if options.guided_only else (True, False):
+            child, ours = os.pipe()
+            pid = os.fork()
+            if pid == 0:
+                os.write(ours, hunted(mutant, source, options.cpu, guided=guided).encode())
+                os._exit(0)
+            os.waitpid(pid, 0)
+            os.close(ours)
+            with os.fdopen(child) as text:
+                says = text.read()
+            missed += guided and not says.startswith("found")
+            print(f"{mutant.__name__:10} {'guided' if guided else 'chance'}: {says}", flush=True)
+    return 0 if 10 * missed <= len(chosen) else 1
+
+
+def _names() -> list[str]:
+    return [one.__name__ for one in MUTANTS]
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
