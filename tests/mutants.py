@@ -174,7 +174,7 @@ def hunted(mutant: Callable[[], None], source: str, cpu_s: float, *, guided: boo
     hunt = Hunt(source, 1, 1, guided=guided)
     spent = 0.0
 
-    def is_over(_: int) -> bool:
+    def is_over(_: Hunt) -> bool:
         nonlocal spent
         spent = used()
         return spent > cpu_s

@@ -6,15 +6,18 @@ import argparse
 import os
 import shlex
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 from compose.errors import ENDED, STOPPED_STATUS, VIOLATED, UserError, writing
 from compose.extras import need
 from compose.launch.signals import StoppedBySignal
 from compose.scenario.scenario_file import setting
+from compose.sweep.hunt.coverage import never
+from compose.sweep.hunt.mutation import fault_lines
+from compose.sweep.hunt.search import Found, Hunt
 from compose.terminal.invocation import program
 from compose.terminal.text_width import tell
+from protocol.output import one_line
 
 PROGRESS_S = 10.0
 """The time in s between two lines about the progress."""
@@ -24,68 +27,53 @@ def main(options: argparse.Namespace) -> int:
     """Hunt, say what was reached, write the input that was found, and return the exit status."""
     setting(options.scenario)  # a mistake in it is the user's
     need("tomli_w")
-    from compose.sweep.hunt.mutation import fault_lines  # noqa: PLC0415  # it imports numpy
-    from compose.sweep.hunt.search import Hunt, Reach  # noqa: PLC0415  # likewise
-
     out: Path = options.out if options.out is not None else Path(f"hunt-{Path(options.scenario).stem}.toml")
     if out.exists():
         raise UserError(f"--out: {out} already exists; choose another file")
     hunt = Hunt(options.scenario, options.seed, options.jobs or os.cpu_count() or 1)
     began = told = time.monotonic()
+
+    def is_over(hunt: Hunt) -> bool:
+        nonlocal told
+        if (now := time.monotonic()) > told + PROGRESS_S and not options.quiet:
+            told = now
+            tell(f"{hunt.runs} runs, {len(hunt.seen)} states and transitions, {len(hunt.corpus)} inputs kept")
+        return bool(hunt.runs >= options.runs if options.runs else now >= began + 60.0 * options.minutes)
+
     if not options.quiet:
         tell(f"{options.scenario}: {len(hunt.seeds)} inputs to begin with; Ctrl-C ends the hunt")
-
-    def progress(reach: Reach) -> None:
-        nonlocal told
-        if time.monotonic() > told + PROGRESS_S and not options.quiet:
-            told = time.monotonic()
-            tell(f"{reach.runs} runs, {len(reach.seen)} states and transitions, {reach.corpus} inputs kept")
-
     try:
-        found = hunt.run(_end(options, began), progress)
+        found = hunt.run(is_over)
     except StoppedBySignal:
-        _say_reached(hunt.reach(), options.scenario, time.monotonic() - began)
+        _say_reached(hunt, options.scenario, time.monotonic() - began)
         return STOPPED_STATUS
-    _say_reached(hunt.reach(), options.scenario, time.monotonic() - began)
+    _say_reached(hunt, options.scenario, time.monotonic() - began)
     if found is None:
         tell("no invariant was broken")
         return ENDED
-    import tomli_w  # noqa: PLC0415  # the library is optional
-
-    lines = [
-        f"# {found.breach.kind}: {found.breach.what}",
-        f"# Found by {_command(options)}, run {found.runs}.",
-    ]
-    with writing(f"--out {out}"):
-        out.write_text("\n".join([*lines, tomli_w.dumps(found.table)]))
-    tell(f"{found.breach.kind}: {found.breach.what}")
+    _write(found, out, f"tandem hunt {shlex.quote(options.scenario)} --seed {options.seed}")
     count = fault_lines(found.table, hunt.seeds[0])
+    tell(f"{found.breach.kind}: {found.breach.what}")
     tell(f"{out}: {count} changes of {options.scenario}; {program('tandem')} run {shlex.quote(str(out))}")
     return VIOLATED
 
 
-def _end(options: argparse.Namespace, began: float) -> Callable[[int], bool]:
-    """Return when the hunt is over, given the number of its runs."""
-    if options.runs is not None:
-        most: int = options.runs
-        return lambda runs: runs >= most
-    seconds: float = 60.0 * options.minutes
-    return lambda _: time.monotonic() >= began + seconds
-
-
-def _say_reached(reach: object, scenario: str, seconds: float) -> None:
-    from compose.sweep.hunt.coverage import never  # noqa: PLC0415  # it imports numpy
-    from compose.sweep.hunt.search import Reach  # noqa: PLC0415  # likewise
-
-    assert isinstance(reach, Reach)
+def _say_reached(hunt: Hunt, scenario: str, seconds: float) -> None:
     tell(
-        f"{scenario}: {reach.runs} runs in {seconds:.0f} s, {reach.processes} also as processes; "
-        f"{reach.refused} inputs are no mission; {len(reach.seen)} states and transitions reached"
+        f"{scenario}: {hunt.runs} runs in {seconds:.0f} s, {hunt.processes} also as processes; "
+        f"{hunt.refused} inputs are no mission; {len(hunt.seen)} states and transitions reached"
     )
-    for kind, names in never(set(reach.seen)).items():
+    for kind, names in never(hunt.seen).items():
         if names:
             tell(f"never reached, {kind}: {', '.join(names)}")
 
 
-def _command(options: argparse.Namespace) -> str:
-    return f"tandem hunt {shlex.quote(options.scenario)} --seed {options.seed}"
+def _write(found: Found, out: Path, command: str) -> None:
+    import tomli_w  # noqa: PLC0415  # the library is optional
+
+    lines = [
+        f"# {found.breach.kind}: {one_line(found.breach.what)}",
+        f"# Found by {command}, run {found.runs}.",
+    ]
+    with writing(f"--out {out}"):
+        out.write_text("\n".join([*lines, tomli_w.dumps(found.table)]))

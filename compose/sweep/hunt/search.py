@@ -5,17 +5,17 @@ from __future__ import annotations
 import multiprocessing
 import random
 import signal
-import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from itertools import count
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
+from compose.errors import UserError
 from compose.launch.supervisor import ChildFailed
 from compose.sweep.hunt import coverage
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
-from compose.sweep.hunt.mutation import Known, Table, mutated, seeds, simpler
+from compose.sweep.hunt.mutation import Known, Table, is_noisy, mutated, seeds, simpler
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
@@ -24,8 +24,12 @@ HANG_S = 600.0
 """The time in s after which an input counts as one that never ends."""
 PROCESSES_EACH = 100
 """The number of runs after which an input with kills also runs as processes."""
-NEWEST = 8
+SEEDS_OF_BATCH = 4
+"""The number of the first inputs in a batch, until all have run."""
+NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
+NOISY_SHARE = 0.1
+"""The share of an input with noisy sensors, whose runs take twenty times as long, relative to the others."""
 
 
 class Entry(NamedTuple):
@@ -42,21 +46,6 @@ class Found(NamedTuple):
     breach: Breach
     runs: int
     """The number of the run that found it."""
-    shrinking: int
-    """The number of runs in which it was shrunk."""
-
-
-class Reach(NamedTuple):
-    """What the runs of a hunt have reached so far."""
-
-    runs: int
-    processes: int
-    """The number of runs as processes."""
-    refused: int
-    """The number of inputs that no mission can have."""
-    corpus: int
-    """The number of inputs that reached something new."""
-    seen: frozenset[str]
 
 
 class Hunt:
@@ -64,23 +53,20 @@ class Hunt:
 
     def __init__(self, source: str, seed: int, jobs: int, *, guided: bool = True) -> None:
         """`guided` is whether inputs that reach something new are kept; otherwise, chance alone decides."""
-        self.seeds = list(seeds(source))
+        self.seeds = seeds(source)
         """The inputs with which the hunt begins, the source first."""
         self._seed, self._jobs, self._guided = seed, jobs, guided
-        self._corpus: list[Entry] = []
-        self._seen: set[str] = set()
+        self.corpus: list[Entry] = []
+        """The inputs that reached something new."""
+        self.seen: set[str] = set()
+        """What the runs have reached."""
         self.runs = self.processes = self.refused = 0
+        """The numbers of inputs, of those that also ran as processes, and of those that are no mission."""
 
-    def reach(self) -> Reach:
-        """Return what has been reached."""
-        return Reach(self.runs, self.processes, self.refused, len(self._corpus), frozenset(self._seen))
+    def run(self, is_over: Callable[[Hunt], bool]) -> Found | None:
+        """Search until `is_over`, and return the first input that breaks an invariant, shrunk.
 
-    def run(
-        self, is_over: Callable[[int], bool], progress: Callable[[Reach], None] = lambda _: None
-    ) -> Found | None:
-        """Search until `is_over` of the number of runs, and return the first input that breaks an invariant.
-
-        The input is shrunk. `progress` is called after each batch.
+        `is_over` is asked after each batch.
         """
         with _workers(self._jobs) as examine:
             for number in count():
@@ -91,50 +77,49 @@ class Hunt:
                     if result.breaches:
                         return _shrunk(table, result.breaches[0], self.runs, examine)
                     self._keep(table, result)
-                if (found := self._as_processes(inputs)) is not None:
+                if (found := self._as_processes(inputs)) is not None or is_over(self):
                     return found
-                progress(self.reach())
-                if is_over(self.runs):
-                    return None
         return None
 
     def _batch(self, number: int) -> list[Table]:
-        """Return the inputs of batch `number`: the seeds first, then mutations."""
-        left = self.seeds[number * BATCH : (number + 1) * BATCH]
+        """Return the inputs of batch `number`: a few of the seeds while there are some, and mutations."""
+        left = self.seeds[number * SEEDS_OF_BATCH : (number + 1) * SEEDS_OF_BATCH]
         draw = random.Random(f"{self._seed}/hunt/{number}")
         return [*left, *[self._input(draw) for _ in range(BATCH - len(left))]]
 
     def _input(self, draw: random.Random) -> Table:
-        if not self._guided or not self._corpus:
+        """Return a mutation of an input of the corpus, or without the guide of one of the first inputs."""
+        if not self._guided or not self.corpus:
             one = draw.choice(self.seeds)
             known = Known(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
             return mutated(one, known, draw.choice(self.seeds), draw)
-        latest = self._corpus[-NEWEST:] if draw.random() < 0.5 else self._corpus
-        entry = draw.choice(latest)
-        return mutated(entry.table, entry.known, draw.choice(self._corpus).table, draw)
+        latest = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
+        shares = [NOISY_SHARE if is_noisy(one.table) else 1.0 for one in latest]
+        [entry] = draw.choices(latest, shares)
+        return mutated(entry.table, entry.known, draw.choice(self.corpus).table, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
-        new = result.reached - self._seen
-        self._seen |= new
+        new = result.reached - self.seen
+        self.seen |= new
         if new:
-            self._corpus.append(Entry(table, result.known))
+            self.corpus.append(Entry(table, result.known))
 
     def _as_processes(self, inputs: Sequence[Table]) -> Found | None:
-        """Run the last of `inputs` that has kills as processes, if it is time for that."""
-        if self.runs // PROCESSES_EACH == (self.runs - len(inputs)) // PROCESSES_EACH:
-            return None
-        for table in reversed(inputs):
-            if table.get("kill") and examined(table).refused is None:
-                self.processes += 1
+        """Run the first of `inputs` that has kills as processes, if it is time for that."""
+        due = self.runs // PROCESSES_EACH > (self.runs - len(inputs)) // PROCESSES_EACH
+        for table in [one for one in inputs if one.get("kill")] if due else ():
+            try:
                 scenario, kills = scenario_of(table)
-                try:
-                    differing = as_processes(scenario, audit=False, kills=kills).differing
-                except ChildFailed as error:
-                    return Found(table, Breach("a process dies", str(error)), self.runs, 0)
-                if differing:
-                    what = f"as processes: {', '.join(differing)}"
-                    return Found(table, Breach("the recording differs", what), self.runs, 0)
-                return None
+                self.processes += 1
+                differing = as_processes(scenario, audit=False, kills=kills).differing
+            except UserError:
+                continue
+            except ChildFailed as error:
+                return Found(table, Breach("a process dies", str(error)), self.runs)
+            if differing:
+                what = f"as processes: {', '.join(differing)}"
+                return Found(table, Breach("the recording differs", what), self.runs)
+            break
         return None
 
 
@@ -143,36 +128,28 @@ Examine = Callable[[Sequence[Table]], Iterator[Examined]]
 
 def _shrunk(table: Table, breach: Breach, runs: int, examine: Examine) -> Found:
     """Return the smallest input that breaks the same invariant, from which nothing more can be left out."""
-    tried, left = 0, [table]
-    while left:
+    while True:
+        left = list(simpler(table))
         for smaller, result in zip(left, examine(left), strict=True):
-            tried += 1
             same = next((one for one in result.breaches if one.kind == breach.kind), None)
             if same is not None:
                 table, breach = smaller, same
-                left = list(simpler(table))
                 break
         else:
-            left = []
-    return Found(table, breach, runs, tried)
+            return Found(table, breach, runs)
 
 
 @contextmanager
 def _workers(jobs: int) -> Iterator[Examine]:
     """Yield a function that examines inputs in `jobs` processes, forked from this one, in their order."""
-    context = multiprocessing.get_context("fork")
-    pool = context.Pool(jobs, _begin)
+    pool = multiprocessing.get_context("fork").Pool(jobs, _begin)
 
-    def examine(tables: Sequence[Mapping[str, Any]]) -> Iterator[Examined]:
-        nonlocal pool
-        results = [pool.apply_async(examined, (dict(table),)) for table in tables]
-        for one in results:
-            began = time.monotonic()
+    def examine(tables: Sequence[Table]) -> Iterator[Examined]:
+        for one in [pool.apply_async(examined, (table,)) for table in tables]:
             try:
                 yield one.get(HANG_S)
             except multiprocessing.TimeoutError:
-                waited = f"no result within {time.monotonic() - began:.0f} s"
-                yield Examined((Breach("it never ends, or its process dies", waited),))
+                yield Examined((Breach("it never ends", f"no result within {HANG_S:g} s"),))
 
     try:
         yield examine
