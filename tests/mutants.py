@@ -44,14 +44,15 @@ def edited(owner: Any, name: str, old: str, new: str) -> None:
 
 
 def unflushed() -> None:
-    """A Command of the last manoeuvre reaches the journal only with the next frame."""
+    """The frames of a Command of the last manoeuvre reach the journal only with the next ones."""
     write = Journal.write
 
     def later(self: Journal, *frames: bytes) -> None:
-        held = getattr(self, "held", ())
-        is_command = len(frames) <= 3 and any(b"\xa7command" in one and b"last-man" in one for one in frames)
-        vars(self)["held"] = frames[-1:] if is_command else ()
-        write(self, *held, *(frames[:-1] if is_command else frames))
+        held: tuple[bytes, ...] = vars(self).pop("held", ())
+        if len(frames) <= 3 and any(b"\xa7command" in one and b"last-man" in one for one in frames):
+            vars(self)["held"], frames = frames, ()
+        if held or frames:
+            write(self, *held, *frames)
 
     setattr(Journal, "write", later)  # noqa: B010
 

@@ -25,7 +25,7 @@ from world.radio_models import (
     LogDistanceRadio,
     WalledRadio,
 )
-from world.range_models import FadingRange, WalledRange
+from world.range_models import AttackedRange, FadingRange, WalledRange
 from world.scenario import Scenario
 from world.world_models import RadioModel, Radios, RangeModel, Transmission
 
@@ -122,6 +122,19 @@ def test_a_wall_blocks_what_crosses_it() -> None:
     assert sent(radio, 4.0, 1) == [0]
     with pytest.raises(ValueError, match=r"segments\[0\] has 2 numbers"):
         WalledRadio([[1.0, 2.0]])
+
+
+def test_an_attack_changes_the_ranges_of_one_link_while_it_lasts() -> None:
+    link = radios(10.0, 5, "mutual/a")
+    longer = AttackedRange("mutual/a", by=1.5, relay=2.0, begins=5, ends=6)
+    assert (longer.detects(link, 8.0), longer.measured(link, 9.9)) == (True, 11.4)
+    assert not longer.detects(link, 7.9)
+    for other in (radios(10.0, 4, "mutual/a"), radios(10.0, 6, "mutual/a"), radios(10.0, 5, "anchor/a")):
+        assert (longer.detects(other, 8.0), longer.measured(other, 9.9)) == (False, 9.9)
+    assert AttackedRange("mutual/a", by=-20.0).measured(link, 9.9) == 0.0
+    assert AttackedRange("mutual/a", jam=True).measured(link, 9.9) is None
+    with pytest.raises(ValueError, match="relay -1 not from 0"):
+        AttackedRange("mutual/a", relay=-1.0)
 
 
 def test_detection_fades_between_full_and_r() -> None:

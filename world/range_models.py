@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 from world.world_models import Point, Radios, RangeModel
@@ -66,7 +67,49 @@ class WalledRange(RangeModel):
         return any(crosses(radios.one, radios.other, wall) for wall in self.segments)
 
 
+class AttackedRange(RangeModel):
+    """A disc in which somebody attacks the ranges of one link. `link` is the name of its `Radios`."""
+
+    def __init__(
+        self,
+        link: str,
+        by: float = 0.0,
+        relay: float = 0.0,
+        jam: bool = False,
+        begins: int = 0,
+        ends: int = 10**9,
+    ) -> None:
+        """The attack lasts from tick `begins` until before `ends`.
+
+        Ranges are longer by `by` m, or shorter if it is negative. A relay makes the radios detect each other
+        up to `relay` m beyond R. With `jam`, no range is measured.
+        """
+        if not (math.isfinite(by) and 0.0 <= relay <= LONGEST_RELAY):
+            raise ValueError(
+                f"by {by:g} is not a number, or relay {relay:g} not from 0 to {LONGEST_RELAY:g} m"
+            )
+        self.link, self.by, self.relay, self.jam = link, by, relay, jam
+        self.begins, self.ends = begins, ends
+
+    def detects(self, radios: Radios, reach: float) -> bool:
+        """Return whether the two radios detect each other."""
+        return radios.distance <= reach + (self.relay if self._attacks(radios) else 0.0)
+
+    def measured(self, radios: Radios, rho: float) -> float | None:
+        """Return the range that the attack leaves of `rho`; None if it is jammed."""
+        if not self._attacks(radios):
+            return rho
+        return None if self.jam else max(0.0, rho + self.by)
+
+    def _attacks(self, radios: Radios) -> bool:
+        return radios.name == self.link and self.begins <= radios.tick < self.ends
+
+
+LONGEST_RELAY = 1e5
+"""The longest distance in m beyond R of a relay."""
+
 RANGE_MODELS: dict[str, type[RangeModel]] = {
+    "attacked": AttackedRange,
     "disc": RangeModel,
     "fading": FadingRange,
     "walls": WalledRange,

@@ -256,7 +256,7 @@ MUTATIONS: Mapping[Callable[[Table, Known, random.Random], Table | None], float]
     _kill: 3.0,
     _attack: 1.0,
     _death: 0.7,
-    _noise: 0.7,
+    _noise: 0.2,
     _planner: 0.3,
     _names: 0.7,
     _geometry: 1.0,

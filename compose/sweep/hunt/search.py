@@ -24,11 +24,11 @@ HANG_S = 600.0
 """The time in s after which an input counts as one that never ends."""
 PROCESSES_EACH = 100
 """The number of runs after which an input with kills also runs as processes."""
-SEEDS_OF_BATCH = 4
-"""The number of the first inputs in a batch, until all have run."""
+SEEDS_OF_BATCH = 1
+"""The number of the first inputs in a batch, until all have run: many have noisy sensors."""
 NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
-NOISY_SHARE = 0.1
+NOISY_SHARE = 0.02
 """The share of an input with noisy sensors, whose runs take twenty times as long, relative to the others."""
 
 
