@@ -162,6 +162,8 @@ class _Network:
         self.tokens: list[tuple[_Link, str]] = []
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._number = count()
+        self._woken: dict[_Process, None] = {}
+        """The processes for which something has arrived at this time, in its order."""
         self._matching: dict[str, list[tuple[_Link, Callable[[_Sample], None]]]] = {}
 
     def at(self, due: float, act: Callable[[], None]) -> None:
@@ -173,9 +175,13 @@ class _Network:
         processes = [_Process(self, name) for name in (WORLD, *[one.id for one in self.scenario.robots])]
         for one in processes:
             self.at(0.0, one.start)
-        while self._due and not self.failures and len(self.ended) < len(processes):
+        while (self._due or self._woken) and not self.failures and len(self.ended) < len(processes):
             self.now, _, act = heapq.heappop(self._due)
             act()
+            if not self._due or self._due[0][0] > self.now:
+                woken, self._woken = self._woken, {}
+                for one in woken:
+                    one.wake()
         if not self._due and len(self.ended) < len(processes):
             self.failures.append("a process that was killed is missing")
         self.over = True
@@ -198,7 +204,7 @@ class _Network:
         def arrive() -> None:
             if link.process.link is link:
                 to(sample)
-                link.process.wake()
+                self._woken[link.process] = None
 
         self.at(self.now + delay, arrive)
 

@@ -170,7 +170,7 @@ def _noise(table: Table, _known: Known, draw: random.Random) -> Table:
     sigma = draw.choice(RANGE_SIGMAS)
     noise: Table = {"anchor_sigma": sigma, "mutual_sigma": sigma}
     if draw.random() < 0.5:
-        noise |= {"outliers": draw.choice((0.05, 0.2)), "mutual_dropout": draw.choice((0.0, 0.2))}
+        noise |= {"outliers": draw.choice((0.05, 0.2)), "drop_outs": draw.choice((0.0, 0.2))}
     if draw.random() < 0.5:
         noise |= {name: {"v": 0.001, "omega": 0.001} for name in ("actuation", "odometry")}
     table["mission"] |= {"noise": noise, "accuracy": max(0.1, 2.0 * sigma)}
@@ -270,8 +270,11 @@ MUTATIONS: Mapping[Callable[[Table, Known, random.Random], Table | None], float]
 def simpler(table: Mapping[str, Any]) -> Iterator[Table]:
     """Yield `table` without one of its parts that are not needed, and with smaller ones in their place."""
     for name in ("fault", "kill"):
-        for i in range(len(table.get(name, []))):
-            yield _with(table, name, [*table[name][:i], *table[name][i + 1 :]])
+        size = len(table.get(name, []))
+        while size:  # first all, then fewer of them
+            for i in range(0, len(table[name]), size):
+                yield _with(table, name, [*table[name][:i], *table[name][i + size :]])
+            size //= 2
     if table.get("group", {}).get("robots", 3) > 3:
         yield _with(table, "group", "robots", table["group"]["robots"] - 1)
     for way, fields in _dispensable(table):

@@ -6,7 +6,8 @@ import multiprocessing
 import random
 import signal
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, redirect_stderr
+from io import StringIO
 from itertools import count
 from typing import NamedTuple
 
@@ -28,8 +29,8 @@ SEEDS_OF_BATCH = 1
 """The number of the first inputs in a batch, until all have run: many have noisy sensors."""
 NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
-NOISY_SHARE = 0.02
-"""The share of an input with noisy sensors, whose runs take twenty times as long, relative to the others."""
+NOISY_SLOWER = 20.0
+"""The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks."""
 
 
 class Entry(NamedTuple):
@@ -37,6 +38,16 @@ class Entry(NamedTuple):
 
     table: Table
     known: Known
+
+    @property
+    def share(self) -> float:
+        """How often it is changed, relative to others: as often as its run is short."""
+        return (
+            1.0
+            / (1 + self.known.ticks)
+            / len(self.known.robots)
+            / (NOISY_SLOWER if is_noisy(self.table) else 1.0)
+        )
 
 
 class Found(NamedTuple):
@@ -75,7 +86,7 @@ class Hunt:
                     self.runs += 1
                     self.refused += result.refused is not None
                     if result.breaches:
-                        return _shrunk(table, result.breaches[0], self.runs, examine)
+                        return _shrunk(table, result.breaches[0], self.runs, self._jobs, examine)
                     self._keep(table, result)
                 if (found := self._as_processes(inputs)) is not None or is_over(self):
                     return found
@@ -94,8 +105,7 @@ class Hunt:
             known = Known(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
             return mutated(one, known, draw.choice(self.seeds), draw)
         latest = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
-        shares = [NOISY_SHARE if is_noisy(one.table) else 1.0 for one in latest]
-        [entry] = draw.choices(latest, shares)
+        [entry] = draw.choices(latest, [one.share for one in latest])
         return mutated(entry.table, entry.known, draw.choice(self.corpus).table, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
@@ -111,7 +121,8 @@ class Hunt:
             try:
                 scenario, kills = scenario_of(table)
                 self.processes += 1
-                differing = as_processes(scenario, audit=False, kills=kills).differing
+                with redirect_stderr(StringIO()):  # what it says about each kill
+                    differing = as_processes(scenario, audit=False, kills=kills).differing
             except UserError:
                 continue
             except ChildFailed as error:
@@ -126,17 +137,17 @@ class Hunt:
 Examine = Callable[[Sequence[Table]], Iterator[Examined]]
 
 
-def _shrunk(table: Table, breach: Breach, runs: int, examine: Examine) -> Found:
+def _shrunk(table: Table, breach: Breach, runs: int, jobs: int, examine: Examine) -> Found:
     """Return the smallest input that breaks the same invariant, from which nothing more can be left out."""
-    while True:
-        left = list(simpler(table))
-        for smaller, result in zip(left, examine(left), strict=True):
+    left = list(simpler(table))
+    while left:
+        tried, left = left[:jobs], left[jobs:]
+        for smaller, result in zip(tried, examine(tried), strict=True):
             same = next((one for one in result.breaches if one.kind == breach.kind), None)
             if same is not None:
-                table, breach = smaller, same
+                table, breach, left = smaller, same, list(simpler(smaller))
                 break
-        else:
-            return Found(table, breach, runs)
+    return Found(table, breach, runs)
 
 
 @contextmanager
