@@ -103,12 +103,13 @@ def kept() -> None:
 
 
 def lost() -> None:
-    """A hypothesis is lost when the peer is in range again."""
+    """A hypothesis is lost when the peer is in range again, after it was not."""
     edited(
         exact_estimator,
         "_with_placements",
         "    return replace(belief, placements=remaining",
-        "    if len(remaining) > 1 and [one.range is None for one in observations[-2:]] == [True, False]:\n"
+        "    gone = [one.range is None for one in observations]\n"
+        "    if len(remaining) > 1 and (True, False) in zip(gone, gone[1:]):\n"
         "        remaining = remaining[1:]\n"
         "    return replace(belief, placements=remaining",
     )

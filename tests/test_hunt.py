@@ -17,6 +17,7 @@ from compose.launch import in_process, virtual_processes
 from compose.scenario.kills import KILL_POINTS
 from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
+from compose.sweep.hunt.coverage import never
 from compose.sweep.hunt.mutation import fault_lines
 from compose.sweep.hunt.search import Hunt
 from protocol.journal.journal_file import MemoryJournal, packed
@@ -101,3 +102,24 @@ def test_ctrl_c_ends_a_hunt_with_what_it_has_reached(tmp_path: Path) -> None:
         ended = hunting.ended()
     assert ended.status == 130
     assert "never reached, tasks:" in ended.out
+
+
+# --- what is reached ----------------------------------------------------------------------------------
+
+UNREACHED = {
+    "tasks": ["asleep", "looping", "sweeping"],
+    "conditions": ["hypothesis", "definite covariance"],
+    "messages": [],
+}
+"""What these hunts do not reach: robots without an anchor are in none of them."""
+
+
+@pytest.mark.long
+@pytest.mark.timeout(3600)
+def test_every_task_condition_and_message_is_reached_in_some_run() -> None:
+    seen: set[str] = set()
+    for source in ("random", "random-group", "noisy", "room", "relative"):
+        hunt = Hunt(source, 1, 2)
+        assert hunt.run(ended_after(160)) is None
+        seen |= hunt.seen
+    assert never(seen) == UNREACHED

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import heapq
 import math
+import random
 import threading
 from collections import deque
 from collections.abc import Callable, Sequence
@@ -37,8 +38,11 @@ from world.simulation import Simulation, resumed
 
 RUN = "virtual"
 """The name of the run."""
-LATENCY_S = 1e-4
-"""The time in s from the sending of a frame to its arrival."""
+LATENCIES_S = (1e-4, 1e-2)
+"""The bounds in s of the time from the sending of a frame to its arrival, which is log-uniform.
+
+Frames on one key arrive in their order.
+"""
 NOTICE_S = 0.01
 """The time in s until others see that a process has been killed."""
 VIRTUAL_START_S = 0.3
@@ -162,6 +166,9 @@ class _Network:
         self.tokens: list[tuple[_Link, str]] = []
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._number = count()
+        self._draw = random.Random(f"{scenario.seed}/latency")
+        self._latest: dict[tuple[_Link, str], float] = {}
+        """The time of the latest arrival at each link on each key."""
         self._woken: dict[_Process, None] = {}
         """The processes for which something has arrived at this time, in its order."""
         self._matching: dict[str, list[tuple[_Link, Callable[[_Sample], None]]]] = {}
@@ -190,13 +197,16 @@ class _Network:
         return Ended(self.taken, tuple(self.failures))
 
     def send(self, key: str, frame: bytes) -> None:
-        """Deliver `frame` to all subscribers of `key`, after LATENCY_S."""
+        """Deliver `frame` to all subscribers of `key`, after a time of LATENCIES_S."""
         if key not in self._matching:
             one = zenoh.KeyExpr(key)
             self._matching[key] = [(link, to) for link, keys, to in self.subscribers if keys.intersects(one)]
         sample = _Sample(key, zenoh.ZBytes(frame))
+        low, high = LATENCIES_S
         for link, to in self._matching[key]:
-            self.deliver(link, to, sample, LATENCY_S)
+            due = self.now + low * (high / low) ** self._draw.random()
+            due = self._latest[link, key] = max(due, self._latest.get((link, key), 0.0))
+            self.deliver(link, to, sample, due - self.now)
 
     def deliver(self, link: _Link, to: Callable[[_Sample], None], sample: _Sample, delay: float) -> None:
         """Give `sample` to a subscriber of `link` after `delay` s, and let its process run."""
@@ -216,9 +226,9 @@ class _Network:
         self._matching.clear()
         for _, shown in list(self.tokens) if tokens else ():
             if zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(shown)):
-                self.deliver(link, to, _Sample(shown, zenoh.ZBytes(b"")), LATENCY_S)
+                self.deliver(link, to, _Sample(shown, zenoh.ZBytes(b"")), LATENCIES_S[0])
 
-    def show(self, link: _Link, key: str, *, gone: bool = False, delay: float = LATENCY_S) -> None:
+    def show(self, link: _Link, key: str, *, gone: bool = False, delay: float = LATENCIES_S[0]) -> None:
         """Show the liveliness token `key` of `link` to others, or withdraw it."""
         self.tokens.remove((link, key)) if gone else self.tokens.append((link, key))
         kind = zenoh.SampleKind.DELETE if gone else zenoh.SampleKind.PUT
