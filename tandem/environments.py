@@ -13,7 +13,7 @@ from pettingzoo import ParallelEnv
 
 from agent.estimation.following import RETESTED, ClaimRule, Following
 from agent.estimation.judged import FEWEST_FOR_CLAIM
-from agent.estimation.team_measurements import team_measurements
+from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, Ranging, TeamLog
 from compose.errors import UserError
 from protocol.messages import Command, Localised, Observation, RobotConfig, Team, TeamAnchor
@@ -85,7 +85,7 @@ class Environment(ParallelEnv[str, Array, Array]):  # type: ignore[misc]  # it h
         """The number of ranges of each robot that decide about poses, before each tick."""
         self._known = [[none] for _ in none]
         """The number of ticks of each robot that each robot knows, before each tick."""
-        self._following = dict.fromkeys(self.agents, Following())
+        self._estimated = dict.fromkeys(self.agents, (TeamMeasurements(), Following()))
         self._asked = dict.fromkeys(self.agents, 0)
         self._poses = dict.fromkeys(self.agents, ORIGIN)
         return self._sensed(), {robot: {} for robot in self.agents}
@@ -129,7 +129,7 @@ class Environment(ParallelEnv[str, Array, Array]):  # type: ignore[misc]  # it h
         seen = {robot: self._seen(one) for robot, one in observed.items()}
         for robot, one in observed.items():
             self._receive(self._place[robot], one)
-        found: dict[Any, Following] = {}
+        found: dict[Any, tuple[TeamMeasurements, Following]] = {}
         for robot in observed:
             if robot not in self.claims:
                 self._estimate(robot, found)
@@ -171,23 +171,26 @@ class Environment(ParallelEnv[str, Array, Array]):  # type: ignore[misc]  # it h
                 known[sender] = max(known[sender], sent + 1)
         self._known[own].append(known)
 
-    def _estimate(self, robot: str, found: dict[Any, Following]) -> None:
+    def _estimate(self, robot: str, found: dict[Any, tuple[TeamMeasurements, Following]]) -> None:
         """Estimate the poses of all robots, and claim that of `robot` if nothing prevents it.
 
         That is done when the ranges that decide have grown by RETESTED. `found` has the estimates of this
         tick: robots that know the same estimate the same.
         """
-        known, before = self._known[self._place[robot]][-1], self._following[robot]
+        known, before = self._known[self._place[robot]][-1], self._estimated[robot]
         count = sum([ranges[ticks] for ranges, ticks in zip(self._counts, known, strict=True)])
         if count < max(FEWEST_FOR_CLAIM, RETESTED * self._asked[robot]):
             return
         self._asked[robot], key = count, (id(before), *known)
         if key not in found:
             logs = [tuple(log[:ticks]) for log, ticks in zip(self._logs, known, strict=True)]
-            used = team_measurements(TeamLog(tuple(logs), ()), self._team, self._mission)
-            rule = ClaimRule(self._mission.accuracy, self._mission.confidence)
-            found[key] = before.after(used, rule, "team")
-        after = self._following[robot] = found[key]
+            measured = before[0].grown(TeamLog(tuple(logs), ()), self._team, self._mission)
+            used, rule = (
+                measured.joint(self._team, self._mission),
+                ClaimRule(self._mission.accuracy, self._mission.confidence),
+            )
+            found[key] = measured, before[1].after(used, rule, "team", self._team.robots)
+        _, after = self._estimated[robot] = found[key]
         if after.reasons.get(robot) == "":
             self.claims[robot] = after.judged[robot].localised
 
