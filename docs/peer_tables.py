@@ -63,7 +63,7 @@ def results() -> Results:
     return msgspec.json.decode(RESULTS.read_bytes(), type=Results)
 
 
-HEAD = ("error p50 / p90, m", "more than 1 m off", "NEES, median", "99 % region holds", "CPU")
+HEAD = ("error p50 / p90, m", "more than 1 m off", "NEES, median", "99 % region holds", "CPU", "claims")
 
 
 def full_table(recording: str) -> str:
@@ -79,7 +79,7 @@ def short_table() -> str:
         table([one for one in chosen if one.ranges == ranges]) for ranges in ("as recorded", "raw radios")
     )
     rows = []
-    for (_, name, error, far, _, holds, cpu), (_, _, *other) in zip(as_recorded, raw, strict=True):
+    for (_, name, error, far, _, holds, cpu, _), (_, _, *other) in zip(as_recorded, raw, strict=True):
         errors = [one.partition(" / ")[0] for one in (error, other[0])]
         rows.append([name, *map(" / ".join, (errors, (far, other[1]), (holds, other[3]), (cpu, other[4])))])
     return _markdown(
@@ -111,6 +111,7 @@ def table(trials: Iterable[Trial]) -> list[list[str]]:
                     _short(float(np.median(nees))),
                     f"{100.0 * np.mean(nees <= REGION):.0f} %",
                     f"{sum(one.cpu_s for one in own) / usual:.2g}",
+                    str(sum(one.claims for one in own)) if name == TANDEM else "-",
                 ]
             )
     return rows

@@ -43,7 +43,7 @@ from docs.picture import here
 from docs.plaza_csv import convert
 from protocol.motion import wrap
 
-WINDOW_S = 30.0
+WINDOW_S, PLAZA_STEP_S = 30.0, 120.0
 SEED = 45
 ACCURACY_M = 0.3
 ESTIMATORS: Mapping[str, Callable[[peers.Problem, np.random.Generator], peers.Solution]] = {
@@ -100,13 +100,17 @@ def tiers_windows(source: Path, step_s: float = WINDOW_S) -> Iterator[Window]:
 
 
 def windows_of(
-    name: str, source: Path, noise: str | None, robots: Sequence[tuple[str, ...]] = ()
+    name: str,
+    source: Path,
+    noise: str | None,
+    robots: Sequence[tuple[str, ...]] = (),
+    step_s: float = WINDOW_S,
 ) -> Iterator[Window]:
-    """Yield the windows of another recording, one after another; of its only robot, if none are named."""
+    """Yield the windows of another recording, every `step_s`; of its only robot, if none are named."""
     recording = read_ranges(source)
     first, last = recording.span
     for own in robots or [tuple(one.id for one in recording.robots)]:
-        for begin_s in np.arange(0.0, last - first - WINDOW_S, WINDOW_S).tolist():
+        for begin_s in np.arange(0.0, last - first - WINDOW_S, step_s).tolist():
             yield Window(name, "as recorded", source, own, begin_s, noise)
 
 
@@ -250,7 +254,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             windows += windows_of("LIAS", options.lias, "uwb")
         if options.plaza is not None:
             convert(options.plaza, folder / "plaza")
-            windows += windows_of("Plaza 1", folder / "plaza", "uwb")
+            windows += windows_of("Plaza 1", folder / "plaza", "uwb", step_s=PLAZA_STEP_S)
         if options.mrclam is not None:
             windows += windows_of("MRCLAM 6", options.mrclam, None, [("A", "B"), ("C", "D")])
         windows = [
@@ -268,8 +272,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         done = {one.recording for one in trials}
         kept = results().trials if RESULTS.exists() else []
         trials = [*trials, *[one for one in kept if one.recording not in done]]
+        known = results() if others else None  # of TIERS, which is not measured again
         packages = {one: version(one) for one in ("gtsam", "scipy", "numpy")}
-        content = msgspec.to_builtins(Results(code_hash(), here(), packages, trials))
+        content = msgspec.to_builtins(Results(known.code if known else code_hash(), here(), packages, trials))
         lines = ",\n".join(json.dumps(one) for one in content.pop("trials"))
         RESULTS.write_text(json.dumps(content)[:-1] + f', "trials": [\n{lines}\n]}}\n')
 
