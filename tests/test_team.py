@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import tandem
+from agent.estimation.gaussian.claim_agreement import united
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
 from agent.planning.team import TeamPlanner, TeamState
@@ -26,11 +27,12 @@ from compose.recording.summary_json import summary
 from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import load, parse, template_of, validate
 from compose.scenario.shipped_files import shipped
+from compose.sweep.group_columns import group_columns
 from compose.sweep.trial import Trial, row
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Contact, Localised, NamedRange, Observation
 from protocol.mission import Anchor
-from protocol.motion import Controls
+from protocol.motion import Controls, Covariance, Pose
 from protocol.team_motion import spiral
 from protocol.wire import decode, encode
 from tests.commands import journals
@@ -193,6 +195,43 @@ def test_the_others_go_on_without_a_robot_that_dies_and_the_outcome_names_it(tmp
     assert validate(file_table(read(out).scenario), "again").scenario == read(out).scenario
 
 
+def test_poses_unite_to_a_claim_that_covers_all_of_them_or_to_none() -> None:
+    noisy, exact = load("room").mission, load("paper-1").mission
+    wide = Covariance(*[0.004, 0.0, 0.0, 0.004, 0.0, 0.0004])
+    one = Localised(Pose(1.0, 2.0, 0.5), wide)
+    claim = united([one, Localised(Pose(1.02, 2.0, 0.5), wide)], noisy)
+    assert claim is not None
+    assert claim.covariance is not None
+    assert claim.pose.x == 1.02
+    assert claim.covariance.xx == pytest.approx(0.004 + 0.02**2)
+    assert united([one, Localised(Pose(1.6, 2.0, 0.5), wide)], noisy) is None, "they contradict each other"
+    assert united([one, Localised(Pose(1.1, 2.0, 0.5), wide)], noisy) is None, "not accurate enough"
+    assert united([Localised(Pose(1.0, 2.0, 0.5)), Localised(Pose(1.0, 2.0 + 1e-9, 0.5))], exact) is not None
+    assert united([Localised(Pose(1.0, 2.0, 0.5)), Localised(Pose(1.0, 2.001, 0.5))], exact) is None
+
+
+EXACT = MISSION.replace("\nnoise =", "\n# noise =")
+
+
+RADIUS, SCALE = '"radius", size = 0.5', '"scale", size = 0.3'
+
+
+@pytest.mark.parametrize(
+    "case", series([(RADIUS, MISSION), (SCALE, EXACT), (RADIUS, EXACT), (SCALE, MISSION)], 1)
+)
+def test_a_team_that_tolerates_false_data_claims_right_poses(case: tuple[str, str]) -> None:
+    attack, sensors = case
+    mission = sensors.replace("= 5.0", "= 3.0") + "tolerates = 1\n"
+    drawn = DRAWN.replace("robots = 2", "robots = 4").replace("side = 4.0", "side = 8.0")
+    scenario = team("", f"{drawn}attack = {{kind = {attack}}}\n", mission)
+    assert template_of(file_table(scenario)).scenario == scenario
+    run = of_frames(kept(scenario))
+    assert audit_run(run).violations == ()
+    columns = group_columns(run)
+    assert columns is not None
+    assert (columns.honest_localised, columns.honest_wrong) == (3, 0)
+
+
 # --- reports -------------------------------------------------------------------------------------------
 
 DELIVERIES = st.lists(
@@ -297,6 +336,12 @@ def test_a_report_changes_no_entry_leaves_no_gap_and_names_no_place_beyond_the_t
     assert after(LogPart(1, 0, (stray,) * has)).log.logs == plain, "what it has contradicts"
     assert after(LogPart(1, has + 1, (stray,))).log.logs == plain, "a tick is missing"
     assert after(LogPart(99, 0, (stray,))).log.logs == plain, "there is no such robot"
+    alone = replace(observed.log, hearsay=False)
+    third = TeamReport(1, (LogPart(2, len(plain[2]), (stray,)), LogPart(1, has, (stray,))), (0, 0, 0), (1, 2))
+    believed = alone.received([third], 0)
+    assert believed.logs == (plain[0], (*plain[1], stray), plain[2]), "what it tells of a third robot"
+    assert believed.done == {1}
+    assert [part.robot for part in alone.report(0, 1).parts] == [0]
     found = after(LogPart(1, has, (stray,)))
     assert found.log.logs[1] == (*plain[1], stray)
     bare = after(LogPart(1, has, (Entry(Controls(0.2, 0.1)),)))
@@ -333,7 +378,18 @@ DRAWN = "[team]\nrobots = 2\nside = 4.0\nanchors = 3\n"
         ({"robots": TWO, "more": "[team]\nrobots = 2\nside = 4.0"}, "team: its robots and anchors are drawn"),
         ({"robots": "", "anchors": DRAWN + "unknown = 4"}, "team.unknown: more than team.anchors = 3"),
         ({"robots": ALONE + "\nanchor = [0.0, 0.0]"}, "robot[0].anchor: it is not for robots that share"),
-        ({"robots": ALONE + '\nattack = {kind = "shift", size = 1.0}'}, "robot[0].attack: it is not for"),
+        (
+            {"robots": ALONE + '\nattack = {kind = "shift", size = 1.0}'},
+            "robot[0].attack: robots of a team be",
+        ),
+        (
+            {"robots": ALONE + '\nattack = {kind = "heading", size = 1.0}'},
+            "robot[0].attack: robots of a team re",
+        ),
+        (
+            {"robots": TWO, "anchors": "", "mission": RELATIVE + "tolerates = 1"},
+            "mission.tolerates: with mission.frame",
+        ),
         ({"robots": TWO + '\npeer = "a"'}, "robot[1].peer: it is not for robots that share"),
         (
             {"robots": "", "anchors": DRAWN.replace("robots = 2", "robots = 1") + "dies = 3"},

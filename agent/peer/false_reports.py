@@ -6,14 +6,16 @@ The attacker's own log is not changed. It drives, measures and plans with the tr
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from itertools import pairwise
 
 from msgspec.structs import replace
 
 from agent.peer.motion_log import MotionLog
+from agent.peer.team_log import Entry
 from protocol.attack import OF_THE_START, Attack
 from protocol.messages import Ranged
-from protocol.motion import Pose, Segment, rotated
+from protocol.motion import Controls, Pose, Segment, rotated
 
 
 def falsified_log(
@@ -38,6 +40,20 @@ def falsified_log(
             falsified = falsified.drove(piece.v, piece.omega, piece.ticks)
         tick += run.ticks
     return falsified
+
+
+def falsified_entries(entries: Sequence[Entry], attack: Attack, period: float) -> tuple[Entry, ...]:
+    """Return the log of a robot of a team, as falsified by `attack`. `period` is T_s in s."""
+    found = []
+    for tick, entry in enumerate(entries):
+        if attack.kind == "radius":
+            ranges = [replace(one, range=max(0.0, one.range + attack.size)) for one in entry.anchors]
+            entry = replace(entry, anchors=tuple(ranges))  # noqa: PLW2901  # the falsified one
+        elif (moved := entry.executed) is not None:
+            told = _falsified(Segment(1, moved.v, moved.omega), tick - 1, attack, 0, len(entries), period)
+            entry = replace(entry, executed=Controls(told.v, told.omega))  # noqa: PLW2901
+        found.append(entry)
+    return tuple(found)
 
 
 def _attacked_span(

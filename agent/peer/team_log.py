@@ -3,11 +3,13 @@
 Each robot has a log with one entry a tick. A report has what its receiver has not acknowledged, of all
 robots: so measurements also reach robots that are never in contact. Entries are only appended, and the first
 one of a tick counts. So a report may be lost, late or repeated, and changes nothing but the time.
+
+If some robots may report false data, a report counts for its sender alone, and there is no hearsay.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from typing import Annotated
 
 import msgspec
@@ -81,12 +83,28 @@ class TeamLog(msgspec.Struct, frozen=True):
     """The number of entries of each robot that each of the others has."""
     done: frozenset[int] = frozenset()
     """The robots that have a result."""
+    hearsay: bool = True
+    """True if a report also counts for robots other than its sender."""
 
     @staticmethod
-    def of(team: Team) -> TeamLog:
+    def of(team: Team, *, hearsay: bool = True) -> TeamLog:
         """Return the logs of a team that has measured nothing yet."""
         count = len(team.robots)
-        return TeamLog(((),) * count, ((0,) * count,) * count)
+        return TeamLog(((),) * count, ((0,) * count,) * count, hearsay=hearsay)
+
+    def only(self, robots: Collection[int]) -> TeamLog:
+        """Return the logs of these robots, with their ranges to anchors and to each other."""
+        return replace(self, logs=tuple([self._among(robots, k) for k in range(len(self.logs))]))
+
+    def _among(self, robots: Collection[int], robot: int) -> tuple[Entry, ...]:
+        if robot not in robots:
+            return ()
+        return tuple(
+            [
+                replace(entry, robots=tuple([one for one in entry.robots if one.to in robots]))
+                for entry in self.logs[robot]
+            ]
+        )
 
     def measured(self, own: int, observation: Observation, team: Team) -> TeamLog:
         """Return the logs with an observation of the robot at the place `own`."""
@@ -112,9 +130,10 @@ class TeamLog(msgspec.Struct, frozen=True):
         for report in reports:
             if report.sender >= count or len(report.known) != count or report.sender == own:
                 continue  # of no robot of this team
-            done = done.union([one for one in report.done if one < count])
+            told = [one for one in range(count) if one != own and (self.hearsay or one == report.sender)]
+            done = done.union([one for one in report.done if one in (*told, own)])
             for part in report.parts:
-                if part.robot < count and part.robot != own and part.since <= len(logs[part.robot]):
+                if part.robot in told and part.since <= len(logs[part.robot]):
                     new = part.entries[len(logs[part.robot]) - part.since :]
                     logs = _replaced(logs, part.robot, (*logs[part.robot], *new)) if new else logs
             known = tuple(map(max, acknowledged[report.sender], report.known))
@@ -124,7 +143,8 @@ class TeamLog(msgspec.Struct, frozen=True):
     def report(self, own: int, peer: int) -> TeamReport:
         """Return the report of the robot at the place `own` to the one at the place `peer`."""
         left, parts, has = MOST_REPORTED_BYTES, [], self.acknowledged[peer]
-        for robot in (own, *[one for one in range(len(self.logs)) if one not in (own, peer)]):
+        others = range(len(self.logs)) if self.hearsay else ()
+        for robot in (own, *[one for one in others if one not in (own, peer)]):
             since, chosen = has[robot], []
             for entry in self.logs[robot][since:]:
                 if entry.size > left:

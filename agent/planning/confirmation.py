@@ -13,12 +13,11 @@ from itertools import combinations
 
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.claim_agreement import agreement, covariance_union
+from agent.estimation.gaussian.claim_agreement import united
 from agent.planning import appointments
 from agent.planning.own_pose import later_pose
 from agent.planning.state import RobotState
 from protocol.messages import Undecided
-from protocol.mission import HEADING_ACCURACY
 
 RANGES_AGAIN, SHARE_AGAIN = 6, 1.1
 """The further ranges to its anchor, and their factor, after which a robot compares its meetings again."""
@@ -123,13 +122,8 @@ def _confirmed(state: RobotState) -> RobotState:
     poses = {one.config.peer: later_pose(one, state) for one in confirming.meetings}
     present_poses = [(peer, pose) for peer, pose in poses.items() if pose is not None]
     for chosen in combinations(present_poses, needed):
-        claims = [pose for _, pose in chosen]
-        if not all(agreement(*two) >= 1.0 - config.mission.confidence for two in combinations(claims, 2)):
-            continue
-        claim = covariance_union(claims)
-        assert claim.covariance is not None
-        position, heading = claim.covariance.position_sigma, claim.covariance.heading_sigma
-        if position <= config.mission.accuracy and heading <= HEADING_ACCURACY:
+        claim = united([pose for _, pose in chosen], config.mission)
+        if claim is not None:
             peers = [peer for peer, _ in chosen]
             meetings = sorted(confirming.meetings, key=lambda one: one.config.peer in peers)
             confirming = replace(state.agenda.confirming, meetings=tuple(meetings))

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import msgspec
@@ -16,6 +17,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.following import ClaimRule, Following
+from agent.estimation.gaussian.claim_agreement import united
 from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.joint_claims import undetermined
 from agent.estimation.gaussian.joint_ranges import near_anchors
@@ -23,6 +25,7 @@ from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.search import of_anchor, position_sigma
 from agent.estimation.posterior import Hypothesis, certainties, same
 from agent.estimation.team_measurements import TeamMeasurements
+from agent.peer.false_reports import falsified_entries
 from agent.peer.team_log import TeamLog, TeamReport
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.drive import pursuit, towards
@@ -52,6 +55,8 @@ ARRIVED = 0.01
 LOOPS_UNTIL_RETURN = 3
 """The time, in loops, for which a robot drives to where it expects a range before it returns."""
 
+UNMET = "it has reported nothing"
+"""The reason against a claim by the measurements of a robot that there are none of."""
 LAPS = (0.0, 0.5, -0.5, 1.0, -1.0)
 """The distances by which consecutive laps of the way past an anchor lie outside it, in units of R."""
 
@@ -93,6 +98,17 @@ class Near(NamedTuple):
         return Near(rho, place, tick) if rho < self.range else self._replace(latest=tick)
 
 
+class Known(NamedTuple):
+    """What a robot knows by a part of the measurements."""
+
+    measured: TeamMeasurements = TeamMeasurements()
+    """What the estimate has read of the log."""
+    following: Following = Following()
+    """The estimate of all poses."""
+    why_not: str = UNMET
+    """The reason against a claim; empty if there is none."""
+
+
 class TeamState(msgspec.Struct, frozen=True):
     """The knowledge of a robot of a team, and its task."""
 
@@ -110,7 +126,9 @@ class TeamState(msgspec.Struct, frozen=True):
     measured: TeamMeasurements = TeamMeasurements()
     """What the estimate has read of the log."""
     following: Following = Following()
-    """The estimate of all poses."""
+    """The estimate of all poses; in a team that tolerates false data, by the own measurements alone."""
+    pairs: tuple[Known, ...] = ()
+    """In such a team, the estimate by these and the measurements of each other robot."""
     wanted: tuple[str, ...] = ()
     """The anchors that are not accurate enough yet, the least accurate one first."""
     why_not: str = "it has not moved yet"
@@ -162,7 +180,9 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
     def start(self, config: RobotConfig) -> TeamState:
         """Return the state of a robot that has measured nothing yet."""
         assert config.team is not None
-        return TeamState(config, TeamLog.of(config.team), nearest=(Near(),) * len(config.team.robots))
+        log = TeamLog.of(config.team, hearsay=not config.tolerates)
+        pairs = (Known(),) * len(config.team.robots) if config.tolerates else ()
+        return TeamState(config, log, pairs=pairs, nearest=(Near(),) * len(config.team.robots))
 
     def observe(self, state: TeamState, observation: Observation) -> TeamState:
         """Return `state` with the sensor data of one tick."""
@@ -187,11 +207,15 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
 
     def report(self, state: TeamState) -> TeamReport:
         """Return the report to a robot that has acknowledged nothing."""
-        return state.log.report(state.own, state.own)
+        return self.report_to(state, state.config.robot)
 
     def report_to(self, state: TeamState, peer: str) -> TeamReport:
-        """Return what `peer` has not acknowledged."""
-        return state.log.report(state.own, state.team.robots.index(peer))
+        """Return what `peer` has not acknowledged, falsified if the configuration contains an attack."""
+        log, attack, own = state.log, state.config.attack, state.own
+        if attack is not None:
+            told = falsified_entries(log.logs[own], attack, state.config.mission.period)
+            log = replace(log, logs=(*log.logs[:own], told, *log.logs[own + 1 :]))
+        return log.report(own, state.team.robots.index(peer))
 
     def decide(self, state: TeamState, reports: Sequence[TeamReport] = ()) -> TeamState:
         """Return `state` with the `reports` of others, and with what follows from all measurements."""
@@ -235,7 +259,9 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         """Return the number of hypotheses, their probability, and what prevents a claim."""
         entries, poses = state.log.logs[state.own], _poses(state)
         judged = state.following.judged.get(state.config.robot)
-        tested = judged.inconsistency if judged is not None else None
+        pairs = [one.following.judged.get(state.config.robot) for one in state.pairs]
+        tests = [one.inconsistency for one in (judged, *pairs) if one is not None]
+        p_value = min([one.p_value for one in tests if one is not None], default=None)
         noisy = judged is not None and judged.localised.covariance is not None
         total = math.fsum([one.probability for one in poses])
         return Summary(
@@ -243,7 +269,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
             hypotheses=len(poses) or None,
             probability=min(poses[0].probability / total, 1.0) if noisy and poses else None,
             blocking_reason=state.why_not or None if noisy and state.verdict is None else None,
-            p_value=tested.p_value if noisy and tested is not None else None,
+            p_value=p_value if noisy else None,
         )
 
 
@@ -252,22 +278,31 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
 
 def _followed(state: TeamState) -> TeamState:
     """Return `state` with the estimate by all measurements so far."""
-    mission, config = state.config.mission, state.config
-    measured = state.measured.grown(state.log, state.team, mission)
-    used = measured.joint(state.team, mission)
-    following = state.following.after(
-        used,
-        ClaimRule(mission.accuracy, mission.confidence),
-        "team",
-        (config.robot,),
-    )
-    why_not = following.reasons.get(config.robot)
-    if why_not is None:
-        why_not = undetermined(used.robots.index(config.robot), following.known.located, used)
-    wanted = _wanted(following, state.team, mission.confidence)
+    own, log = state.own, state.log.only((state.own,)) if state.config.tolerates else state.log
+    known = _estimated(state, Known(state.measured, state.following), log)
+    wanted, why_not = _wanted(known.following, state.team, state.config.mission.confidence), known.why_not
     if wanted and not why_not:
         why_not = f"anchor {wanted[0]} is not known to {state.team.survey:g} m yet"
-    return replace(state, measured=measured, following=following, why_not=why_not, wanted=wanted)
+    pairs = tuple(
+        [
+            _estimated(state, pair, state.log.only((own, k))) if k != own and state.log.logs[k] else pair
+            for k, pair in enumerate(state.pairs)
+        ]
+    )
+    measured, following = known.measured, known.following
+    return replace(state, measured=measured, following=following, why_not=why_not, wanted=wanted, pairs=pairs)
+
+
+def _estimated(state: TeamState, before: Known, log: TeamLog) -> Known:
+    """Return the estimate by `log` that goes on from the one `before`."""
+    mission, robot = state.config.mission, state.config.robot
+    measured = before.measured.grown(log, state.team, mission)
+    used, rule = measured.joint(state.team, mission), ClaimRule(mission.accuracy, mission.confidence)
+    following = before.following.after(used, rule, "team", (robot,))
+    why_not = following.reasons.get(robot)
+    if why_not is None:
+        why_not = undetermined(used.robots.index(robot), following.known.located, used)
+    return Known(measured, following, why_not)
 
 
 def _wanted(following: Following, team: Team, confidence: float) -> tuple[str, ...]:
@@ -296,6 +331,11 @@ def _claimed(state: TeamState) -> TeamState:
     """Return `state` with a verdict, if there is one now."""
     if not state.why_not:
         return _with_verdict(state, state.following.judged[state.config.robot].localised)
+    claiming = [pair.following for pair in state.pairs if not pair.why_not]
+    for agreed in combinations(claiming, state.config.tolerates + 1):
+        claim = united([one.judged[state.config.robot].localised for one in agreed], state.config.mission)
+        if claim is not None:  # one of these robots is honest
+            return _with_verdict(replace(state, following=agreed[-1]), claim)
     if state.tick * state.config.mission.period >= state.config.gives_up:
         return _with_verdict(state, Undecided(state.why_not))
     return state

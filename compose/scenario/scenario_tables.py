@@ -72,10 +72,10 @@ class MissionTable(Mission, frozen=True, forbid_unknown_fields=True):
     0: ranges connect all starts.
     """
     tolerates: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
-    """The number of robots of a group that may report false data: one more must agree before a claim.
+    """The number of robots that may report false data: one more must agree before a claim.
 
-    With exact sensors, that holds for robots without an anchor. With noisy ones, it holds for all robots, and
-    all have an anchor.
+    In a team, a robot also claims what its own measurements tell. In groups, with exact sensors, that holds
+    for robots without an anchor. With noisy ones, it holds for all robots, and all have an anchor.
     """
 
     @property
@@ -136,6 +136,8 @@ class TeamTable(_Table, frozen=True):
     """The number m of anchors, which are A1 to Am; none with `mission.frame`."""
     unknown: Annotated[int, Meta(ge=0, le=MAX_ROBOTS)] = 0
     """The number of anchors whose position the robots do not know, the last ones."""
+    attack: Attack | None = None
+    """False data injection by the robot r1."""
     dies: DeathTick | None = None
     """The tick from which on the robot r2 is dead, or the bounds between which it is drawn, both included."""
 

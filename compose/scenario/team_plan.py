@@ -39,7 +39,7 @@ def with_team(file: ScenarioFile, team: TeamTable) -> ScenarioFile:
         known = place if i <= team.anchors - team.unknown else None
         anchors.append(AnchorTable(f"A{i}", known, stands=place))
     area = file.mission.area or (0.0, 0.0, team.side, team.side)
-    robots = [RobotTable(f"r{i}") for i in range(1, team.robots + 1)]
+    robots = [RobotTable(f"r{i}", attack=team.attack if i == 1 else None) for i in range(1, team.robots + 1)]
     return replace(file, robot=robots, anchor=anchors, mission=replace(file.mission, area=area))
 
 
@@ -59,7 +59,7 @@ def planned_team(file: ScenarioFile) -> tuple[PlannedTeam, tuple[RobotSpec, ...]
             if name not in ids:
                 raise BadScenario(f"robot[{i}].anchors: there is no anchor '{name}'{did_you_mean(name, ids)}")
         ranges = tuple([name for name in ids if robot.anchors is None or name in robot.anchors])
-        robots.append(RobotSpec(robot.id, None, None, ORIGIN, ranges=ranges))
+        robots.append(RobotSpec(robot.id, None, None, ORIGIN, robot.attack, ranges))
     known = [one.told for one in anchors]
     if mission.frame is None:
         robots = [_in_range(i, file, one, anchors) for i, one in enumerate(robots)]
@@ -82,16 +82,15 @@ def _check(file: ScenarioFile) -> None:
     if len(file.robot) > MAX_TEAM:
         raise BadScenario(f"robot: {len(file.robot)} robots, and a team has at most {MAX_TEAM}")
     for i, robot in enumerate(file.robot):
-        for name in ("anchor", "peer", "attack"):
+        for name in ("anchor", "peer"):
             if getattr(robot, name) is not None:
                 raise BadScenario(f"robot[{i}].{name}: it is not for robots that share [[anchor]] or a frame")
     _check_mission(file)
+    _check_attacks(file)
 
 
 def _check_mission(file: ScenarioFile) -> None:
     """Raise BadScenario or Unworkable if the mission or its planner is not one of teams."""
-    if file.mission.tolerates:
-        raise Unworkable("mission.tolerates: robots that share all measurements tolerate no false data")
     if file.mission.safety_distance:
         raise Unworkable("mission.safety_distance: robots that share [[anchor]] or a frame keep none")
     if file.planner.name != planner_loader.GROUP_PLANNER:
@@ -108,6 +107,30 @@ def _check_mission(file: ScenarioFile) -> None:
             raise BadScenario("mission.frame: anchors determine the frame, so there can be no [[anchor]]")
         if len(file.robot) < 2:
             raise Unworkable("mission.frame: the poses of at least two robots are relative to each other")
+
+
+def _check_attacks(file: ScenarioFile) -> None:
+    """Raise BadScenario or Unworkable if attacks are none that a team has, or more than it tolerates.
+
+    What a robot of a tolerant team claims follows from its own measurements, or is the same by one more of
+    the others than may report false data. So it needs a frame of its own, and anchors that nobody surveys.
+    """
+    mission, attacks = file.mission, [i for i, one in enumerate(file.robot) if one.attack is not None]
+    for i in attacks:
+        attack = file.robot[i].attack
+        if attack is not None and (attack.kind in ("heading", "reframe") or attack.part != "all"):
+            raise BadScenario(
+                f"robot[{i}].attack: robots of a team report no start and have no phases: the kind is "
+                "scale, rotate, shift or radius, and the part 'all'"
+            )
+    if len(attacks) > mission.tolerates:
+        raise Unworkable(
+            f"robot[{attacks[mission.tolerates]}].attack: robots of a team believe the measurements of all "
+            f"others: set mission.tolerates = {len(attacks)}"
+        )
+    for name, given in (("frame", mission.frame), ("survey", mission.survey)):
+        if mission.tolerates and given:
+            raise Unworkable(f"mission.tolerates: with mission.{name}, robots have to believe others")
 
 
 def _placed_anchor(i: int, file: ScenarioFile) -> PlacedAnchor:

@@ -21,13 +21,14 @@ referee or the launcher uses it; `both`: the robots, and the world unless its ow
 
 FIELDS_OF_USERS: Mapping[User, Mapping[str, str]] = {
     "world": {
-        "": "seed world fault anchor team",
+        "": "seed world fault anchor",
         "robot.": "id anchor anchors start peer dies",
         "group.": "robots spacing without_anchor dies",
+        "team.": "robots side anchors unknown dies",
         "mission.": "sensing_range period max_speed max_turn_rate area frame diameter",
     },
     "robots": {
-        "": "name max_ticks planner kill robot.attack group.attack",
+        "": "name max_ticks planner kill robot.attack group.attack team.attack",
         "mission.": "accuracy confidence safety_distance tolerates survey",
         "mission.noise.": "range_bias pair_bias range_scale slow_sigma slow_time wheel_scale gyro_bias "
         "sigma_degrees survey_error range_delay strays odometry_strays",

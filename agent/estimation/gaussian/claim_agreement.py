@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -25,9 +26,10 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.smoother import Singular
 from agent.peer.motion_log import MotionLog
 from protocol.messages import Localised
-from protocol.mission import Mission
+from protocol.mission import HEADING_ACCURACY, Mission
 from protocol.motion import Pose, compose, inverse, wrap
 from protocol.noise import Noise
+from protocol.rounding import TOLERANCE
 
 
 class ClaimDifference(NamedTuple):
@@ -116,6 +118,23 @@ def covariance_union(claims: Sequence[Localised]) -> Localised:
         off = minus(one.pose, best.pose)
         union = _larger(union, matrix(one) + np.outer(off, off))
     return Localised(best.pose, covariance_of(union))
+
+
+def united(claims: Sequence[Localised], mission: Mission) -> Localised | None:
+    """Return the claim that covers all of `claims`, of one robot and tick; None if it is none.
+
+    It is none if two of them differ by more than they do with probability `mission.confidence` if both are
+    right (with exact sensors, by a tenth of TOLERANCE), or if it is not accurate enough.
+    """
+    if claims[-1].covariance is None:
+        off = [abs(minus(one.pose, claims[-1].pose)).max() for one in claims]
+        return claims[-1] if max(off) <= 0.1 * TOLERANCE else None
+    if not all(agreement(*two) >= 1.0 - mission.confidence for two in combinations(claims, 2)):
+        return None
+    claim = covariance_union(claims)
+    assert claim.covariance is not None
+    position, heading = claim.covariance.position_sigma, claim.covariance.heading_sigma
+    return claim if position <= mission.accuracy and heading <= HEADING_ACCURACY else None
 
 
 def _larger(one: Array, other: Array) -> Array:
