@@ -17,6 +17,7 @@ from agent.planning.paper import Paper
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import RobotState
+from agent.planning.team import TeamPlanner
 from protocol.messages import (
     MAX_BODY_BYTES,
     Command,
@@ -60,6 +61,7 @@ __all__ = [
     "RobotConfig",
     "RobotState",
     "Summary",
+    "TeamPlanner",
     "Undecided",
     "compose",
     "inverse",

@@ -25,6 +25,7 @@ from tandem.planning import (
     RobotConfig,
     RobotState,
     Summary,
+    Undecided,
 )
 
 
@@ -34,6 +35,38 @@ class Parcel(msgspec.Struct, frozen=True, array_like=True):
     log: Report
     double: int
     """Twice the tick of the log."""
+
+
+class Counting(Planner[tuple[RobotConfig, int, int], int]):
+    """A planner for teams, from the contract alone: it ends once all have counted ranges to three anchors."""
+
+    BODY = int
+
+    def start(self, config: RobotConfig) -> tuple[RobotConfig, int, int]:
+        return config, -1, 0
+
+    def observe(
+        self, state: tuple[RobotConfig, int, int], observation: Observation
+    ) -> tuple[RobotConfig, int, int]:
+        return state[0], observation.tick, state[2] + len(observation.anchors)
+
+    def report_to(self, state: tuple[RobotConfig, int, int], peer: str) -> int:
+        return state[2]
+
+    def decide(
+        self, state: tuple[RobotConfig, int, int], reports: Sequence[int] = ()
+    ) -> tuple[RobotConfig, int, int]:
+        return state[0], state[1], max(state[2], *reports, 0)
+
+    def command(self, state: tuple[RobotConfig, int, int]) -> Command:
+        config, tick, counted = state
+        assert config.team is not None
+        enough = counted >= 3 * len(config.team.anchors)
+        verdict = Undecided(f"{counted} ranges counted") if enough else None
+        return Command(tick, config.robot, 0.5, 0.5, 1, "counting", verdict=verdict)
+
+    def estimate(self, state: tuple[RobotConfig, int, int]) -> Estimate:
+        return Estimate(state[1], state[0].robot, (), (), localised=False)
 
 
 class Wrapping(Planner[RobotState, Parcel]):

@@ -54,7 +54,7 @@ from tests import own_planners
 from tests.commands import PAPER_1, TandemProcess
 from tests.commands import tandem as command
 from tests.groups import group_of, table_of
-from tests.own_planners import Parcel, Wrapping
+from tests.own_planners import Counting, Parcel, Wrapping
 from tests.series import series
 from world.scenario import Scenario
 
@@ -152,6 +152,14 @@ def test_the_python_api_takes_a_class_and_its_options() -> None:
         tandem.run("paper-1", planner_options={"note": "n"})
     with pytest.raises(UserError, match="not at the top level of a module"):
         tandem.run("paper-1", planner=type("X", (Paper,), {"__qualname__": "f.<locals>.X"}))
+
+
+def test_a_planner_for_teams_needs_no_more_than_the_contract() -> None:
+    run = tandem.run("room", planner=Counting)
+    assert run.audit().violations == ()
+    assert (run.outcome, run.reason) == ("undecided", "a: 12 ranges counted; b is not localised either")
+    with pytest.raises(UserError, match=r"planner.name: robots with the planner tests.own_planners:Sound"):
+        tandem.run("room", planner="tests.own_planners:Sound")
 
 
 def test_opening_a_recording_loads_no_code(recording: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -63,7 +63,7 @@ def planner_of(config: RobotConfig) -> Planner[Any, Any]:
 def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     """Return a new planner of the robot with this configuration, without a guard. Raises UserError."""
     name = config.planner_name
-    if config.team is not None:
+    if config.team is not None and is_shipped(name):
         from agent.planning.team import TeamPlanner  # noqa: PLC0415  # it imports numpy
 
         return TeamPlanner()
@@ -95,6 +95,18 @@ def is_for_groups(name: str, *, helps: bool = False) -> bool:
 
     found = planner_class(name)
     return issubclass(found, Assured) or (not helps and meets(found))
+
+
+def is_for_teams(name: str) -> bool:
+    """Return whether robots with the planner `name` can form a team. Raises like `planner_class`.
+
+    Planners that exchange the logs of pairs cannot. All others are given the team and may use it.
+    """
+    if is_shipped(name):
+        return name == GROUP_PLANNER
+    from agent.planning.exchange import LogPlanner  # noqa: PLC0415  # it imports numpy
+
+    return not issubclass(planner_class(name), LogPlanner)
 
 
 def meets(planner: type[Planner[Any, Any]]) -> bool:

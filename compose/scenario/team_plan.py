@@ -93,10 +93,10 @@ def _check_mission(file: ScenarioFile) -> None:
     """Raise BadScenario or Unworkable if the mission or its planner is not one of teams."""
     if file.mission.safety_distance:
         raise Unworkable("mission.safety_distance: robots that share [[anchor]] or a frame keep none")
-    if file.planner.name != planner_loader.GROUP_PLANNER:
+    if not planner_loader.is_for_teams(file.planner.name):
         raise Unworkable(
             f"planner.name: robots with the planner {file.planner.name} form pairs and groups; those that "
-            f"share [[anchor]] or a frame have '{planner_loader.GROUP_PLANNER}'"
+            f"share [[anchor]] or a frame have '{planner_loader.GROUP_PLANNER}' or one of your own for teams"
         )
     if file.mission.survey and all(one.position and not one.sigma for one in file.anchor):
         raise BadScenario("mission.survey: all [[anchor]] are surveyed")
