@@ -533,3 +533,5 @@ def test_a_recorded_team_is_audited_and_exported(tmp_path: Path) -> None:
     assert {robot["localised"] for robot in summed["robots"].values()} == {True}
     run = read(out)
     assert all(isinstance(one, Localised) for one in run.verdicts().values())
+    assert "poses are in the frame of that of a" in tandem_command("estimate", out).out
+    assert "b has ranges to no anchor" in tandem_command("estimate", out, "--robots", "b,c").err

@@ -358,7 +358,7 @@ COMMANDS = (
             calibrate` writes [default: the sigmas that the recording states, else uwb]
         {PART_OF_RECORDING}
         --relative ROBOT: estimate in the frame of this robot's first pose, without the positions of anchors \
-            [default: the frame is that of the anchors]
+            [default: the frame of the recording]
         --accuracy M = 0.3: sigma of the position in m that a claim needs [default: %(default)g]
         --confidence P = 0.9999: probability that a claim needs [default: %(default)g]
         --solver MODULE:CLASS: solver of your own, which fits the poses [default: the smoother]

@@ -180,7 +180,7 @@ def measurements(
 
     `noise` is the name of a profile, the path of a file, or what was read of one; None: what the recording
     states. `relative` is the robot whose start defines the frame, in which no anchor has a position; None:
-    the frame is that of the anchors. `ticks` is the number of them in an epoch; None: by the speed of the
+    the frame is that of the recording. `ticks` is the number of them in an epoch; None: by the speed of the
     robots. `doubt` is the suspicion about the units; None: they are examined. Raises UserError.
     """
     told = told_noise(noise) if isinstance(noise, str) else noise
@@ -188,6 +188,8 @@ def measurements(
     assumed = told or stated_noise(part)
     if assumed.correction is not None:
         part = assumed.correction.corrected(part)
+    if relative is None and recording.origin in [one.id for one in part.robots]:
+        relative = recording.origin
     if relative is not None:
         if relative not in (names := [one.id for one in part.robots]):
             raise UserError(f"--relative: {relative} is not among the robots {', '.join(names)}")

@@ -117,6 +117,8 @@ class RangeRecording(NamedTuple):
     ranges: RangeSeries
     unused: Mapping[str, int] = {}
     """The number of entries of the file that are no part of this model, by their kind."""
+    origin: str | None = None
+    """The robot whose first pose defined the frame of a run without anchors; None in that of anchors."""
 
     @property
     def radios(self) -> tuple[str, ...]:
