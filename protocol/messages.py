@@ -711,7 +711,10 @@ class Estimate(Message, frozen=True):
     robot: RobotId
     """The sender."""
     local: tuple[Pose, ...]
-    """The possible poses in the robot's anchor frame, one for each remaining branch: m, m and rad."""
+    """The possible poses in the robot's anchor frame, one for each remaining branch: m, m and rad.
+
+    In a team, the pose in the frame of the one at tick 0, once the robot is located.
+    """
     world: tuple[Pose, ...]
     """The possible poses in <W>, one for each remaining placement: m, m and rad."""
     localised: bool

@@ -514,6 +514,7 @@ def test_every_mistake_of_this_module_has_a_test() -> None:
     classes = {name for name, value in vars(own_planners).items() if isinstance(value, type)}
     mistakes = {name for name in classes if getattr(own_planners, name).__module__ == own_planners.__name__}
     assert mistakes - {*BROKEN} == {
+        "Counting",
         "Parcel",
         "Wrapping",
         "Sound",

@@ -247,7 +247,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         return Estimate(
             state.tick,
             state.config.robot,
-            (),
+            (state.odometry,) if poses else (),
             tuple(world),
             isinstance(state.verdict, Localised),
             tuple([min(one.probability / total, 1.0) for one in poses]) if covariance is not None else (),

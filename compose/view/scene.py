@@ -15,7 +15,17 @@ from compose.view.events import Event, events
 from compose.view.outlines import Point, arc, ellipse
 from compose.view.run_data import TickData
 from compose.view.words import doing
-from protocol.messages import Contact, Localised, MissionEnd, NamedRange, Phase, Probability, Verdict, Word
+from protocol.messages import (
+    Contact,
+    Localised,
+    MissionEnd,
+    NamedRange,
+    Phase,
+    Probability,
+    SurveyedAnchor,
+    Verdict,
+    Word,
+)
 from protocol.mission import Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
@@ -61,6 +71,8 @@ class HeldPoses(msgspec.Struct, frozen=True, omit_defaults=True):
     localised: bool
     arc: tuple[Point, ...] = ()
     """The outline in m of where the first pose in `world` is, if along an arc; empty if in an ellipse."""
+    anchors: tuple[SurveyedAnchor, ...] = ()
+    """The anchors of a team that are not surveyed, as far as the robot has located them."""
 
     @property
     def poses(self) -> tuple[Pose, ...]:
@@ -201,7 +213,8 @@ def held_poses(robot: str | None, now: TickData) -> HeldPoses | None:
     if estimate.world and estimate.covariance is not None:
         bent = arc(estimate.world[0], estimate.covariance)
     return HeldPoses(
-        estimate.local, estimate.world, estimate.probabilities, estimate.covariance, estimate.localised, bent
+        *(estimate.local, estimate.world, estimate.probabilities, estimate.covariance, estimate.localised),
+        *(bent, estimate.anchors),
     )
 
 

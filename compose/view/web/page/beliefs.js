@@ -5,7 +5,7 @@ import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geom
 import { held_now, lacks_bearing } from "./held.js";
 import { NAME } from "./labels.js";
 import { cross, fading, shape } from "./pen.js";
-import { probability } from "./words.js";
+import { metres, probability } from "./words.js";
 
 const FADING = 3;
 const SIGMAS = 3;
@@ -62,6 +62,27 @@ export class Beliefs {
     });
     pen.globalAlpha = 1;
     return undefined;
+  }
+
+  /** Draws where a robot has located the anchors that are not surveyed, with three sigmas: one robot's, as all share their ranges. */
+  anchors(view, robots) {
+    const { store, scene, look, truth } = view, pen = this.plane.context, { labels, marks, scale } = this.plane;
+    const held = robots.map(({ id }) => scene.players[store.places.get(id)]?.held).find((one) => one?.anchors);
+    for (const [id, position, sigma] of held?.anchors ?? []) {
+      const [x, y] = this.plane.at(position), radius = SIGMAS * sigma * scale;
+      if (SIGMAS * sigma > store.stage.mission.sensing_range) continue; // it is hardly anywhere
+      marks.add("located");
+      pen.beginPath();
+      pen.arc(x, y, Math.max(radius, 3), 0, TAU);
+      this.#cloud(look);
+      pen.beginPath();
+      pen.arc(x, y, 2.5, 0, TAU);
+      pen.fillStyle = look.ghost;
+      pen.fill();
+      if (truth) continue; // it has a name where it stands
+      const text = `${id} ± ${metres(sigma)}`, away = Math.max(radius, 5), side = away + 4 + pen.measureText(text).width / 2;
+      labels.put(text, x, y + away + 13, look.ink, "center", { others: [[x, y - away - 5], [x + side, y + 4], [x - side, y + 4]] });
+    }
   }
 
   /** Draws the configurations while a range rules some out, one by one; returns whether it does. */

@@ -41,6 +41,7 @@ const MOMENTARY = {
   "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="2 2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
   ellipse: [drawn('<ellipse cx="15" cy="8" rx="12" ry="5.5" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma)"],
   arc: [drawn('<path d="M2 13q13-15 26 0l-4 2q-9-9-18 0z" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma): along an arc"],
+  located: [drawn('<circle cx="15" cy="8" r="6.5" fill="var(--cloud)" stroke="var(--ghost)"/><circle cx="15" cy="8" r="2" fill="var(--ghost)"/>'), "where a robot has located an anchor (3 sigma)"],
   contact: [drawn('<path d="M1 6h28M1 10h28" stroke="var(--link)" stroke-width="1.4"/>'), "in range of each other"],
   reach: [ring("link", 'stroke-dasharray="3 2.4"'), ({ range }) => `range between robots: ${range}`],
   report: [dot('fill="var(--link)"'), ({ team }) => `report to ${team ? "another" : "the other"} robot`],

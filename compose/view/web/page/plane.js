@@ -286,6 +286,7 @@ export class Plane {
     }
     for (const robot of robots) if (store.grouped ? heads(view, robot) : robot.role === "a") this.#configurations.draw(view, robot);
     for (const robot of robots) if (!focus || robot.id === focus) this.#beliefs.belief(view, robot);
+    this.#beliefs.anchors(view, focus ? robots.filter(({ id }) => id === focus) : robots);
     for (const robot of robots) this.#signals.anchor_range(view, robot);
     const pairs = store.grouped ? links(view) : robots.filter(({ role }) => role === "a").map((robot) => [robot, robot.peer]);
     if (truth) for (const [robot, peer] of pairs) this.#signals.contact(view, robot, peer);
