@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import sys
-import tempfile
 from collections.abc import Mapping, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,6 +13,7 @@ import numpy as np
 from compose.errors import UserError
 from compose.extras import need
 from compose.launch.class_loader import need_module
+from compose.recording.recording_files import folder_for
 from compose.sweep import spec
 from compose.sweep.cells import Cell, label, trial_table
 from compose.sweep.spec import Sweep
@@ -124,8 +123,7 @@ def sweep(
     if workers is not None:
         options = msgspec.structs.replace(options, workers=workers)
     found = _sweep_of(base, axes, trials, seed, paired)
-    with ExitStack() as stack:
-        folder = Path(out) if out is not None else Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    with folder_for(None if out is None else Path(out)) as folder:
         return _results(_run(found, folder, options, visible=progress), kept=out is not None)
 
 
@@ -163,10 +161,9 @@ def arena(
     for name in names:
         need_module(name)
     sweeps = found.sweeps(names, [(one.source, one.table) for one in map(scenario_of, given)], trials, seed)
-    with ExitStack() as stack:
-        folder = Path(out) if out is not None else Path(stack.enter_context(tempfile.TemporaryDirectory()))
+    with folder_for(None if out is None else Path(out)) as folder:
         rows, results = found.run(sweeps, folder, lambda one, to: _run(one, to, options, visible=progress))
-        _check_complete(results[-1], kept=out is not None)
+    _check_complete(results[-1], kept=out is not None)
     return Table({name: _array([row[name] for row in rows]) for name in rows[0]})
 
 

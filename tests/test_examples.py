@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 import sys
 from importlib import import_module
@@ -11,6 +12,7 @@ from typing import Any
 
 import pytest
 
+import tandem
 from tests.series import series
 
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
@@ -61,8 +63,12 @@ def test_the_planner_of_the_page_runs_in_the_arena_as_the_page_shows(tmp_path: P
         [sys.executable, *words], cwd=tmp_path, capture_output=True, text=True, check=False
     )
     shown = [line for line in page.splitlines() if line.startswith((" scenario", " noisy"))]
-    assert len(shown) == 3
+    own, shown = shown[3:], shown[:3]
     assert [line for line in ended.stdout.splitlines() if line in shown] == shown
+    few = tandem.arena(("assured", "greedy"), trials=10)
+    low, high = re.findall(r"\(([+-][\d.]+) to ([+-][\d.]+)\)", own[-1])[0]
+    assert few["more_ticks_low"][1] <= float(high), "the first of 200 trials do not contradict them"
+    assert float(low) <= few["more_ticks_high"][1]
 
 
 @pytest.mark.parametrize("name", WITHOUT_FIGURE)

@@ -31,7 +31,7 @@ def test_help_lists_every_command_once_under_its_group() -> None:
         elif line.startswith("  ") and "-" not in line[:4]:
             group.append(line.split()[0])
     assert {name: listed[name] for name in ("Run", "Deploy", "Analyse", "Check")} == {
-        "Run": ["run", "replay", "scenarios", "init", "sweep", "hunt"],
+        "Run": ["run", "replay", "scenarios", "init", "sweep", "arena", "hunt"],
         "Deploy": ["world", "agent", "robot", "keys", "containers"],
         "Analyse": ["audit", "figures", "export", "estimate", "calibrate", "watch"],
         "Check": ["doctor", "ps", "check-driver", "check-planner", "completion"],

@@ -11,6 +11,7 @@ from compose.cli.sweep import status_of
 from compose.errors import FAILED, STOPPED_STATUS
 from compose.extras import need
 from compose.launch.signals import stop_by_signal
+from compose.recording.recording_files import folder_for
 from compose.scenario.scenario_file import scenario_table
 from compose.sweep.spec import Sweep
 from compose.terminal.text_width import tell
@@ -33,13 +34,16 @@ def main(options: argparse.Namespace) -> int:
 
     scenarios = [(one, scenario_table(one)) for one in options.scenario or ["noisy"]]
     sweeps = arena.sweeps(options.planners, scenarios, options.trials, options.seed)
-    rows, results = arena.run(sweeps, options.out, play)
+    with folder_for(options.out) as out:
+        rows, results = arena.run(sweeps, out, play)
     if results[-1].stopped is not None:
-        inbox.say(f"{results[-1].stopped}: the same command resumes the arena")
+        how = "the same command resumes" if options.out is not None else "with --out, it could be resumed"
+        inbox.say(f"{results[-1].stopped}: {how}")
         return STOPPED_STATUS if results[-1].interrupted else FAILED
     say(*arena.lines(rows))
     if not options.quiet:
         say("")
         tell(arena.NOTE)
-        say("", f"results: {options.out}")
+        if options.out is not None:
+            say("", f"results: {options.out}")
     return max(map(status_of, results))

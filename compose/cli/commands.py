@@ -250,12 +250,13 @@ COMMANDS = (
     ),
     CommandEntry(
         *("arena", "Run", "Compare planners on the same missions."),
-        *("tandem arena assured greedy mine:Own --trials 20", "docs/own-planner.md"),
+        *("tandem arena assured greedy mine:Own --trials 20 --out compared", "docs/own-planner.md"),
         """
         planners PLANNER*: planners to compare, the first of which is the reference: names, or MODULE:CLASS \
             [default: assured paper greedy fisher random]
         --scenario SCENARIO+: scenario of missions: a name or a TOML file; may be repeated [default: noisy]
-        --out DIR = arena: folder for the results; an unfinished arena in it is resumed [default: %(default)s]
+        --out DIR: folder for table, figure and missions, of which those that are in it do not run again \
+            [default: none are kept]
         --trials N: missions of each planner in each scenario, 1 to 10^7 [default: 50]
         --seed S: seed of all missions, 0 to 2^63 - 1 [default: 0]
         --workers N: worker processes, 1 to 1000 [default: one per core]

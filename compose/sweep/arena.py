@@ -13,7 +13,6 @@ from matplotlib.figure import Figure
 
 from compose.errors import UserError
 from compose.figures.style import SWEEP_MEDIUM, look, save
-from compose.recording.recording_files import make_folder
 from compose.sweep import spec
 from compose.sweep.axis_figures import STYLES
 from compose.sweep.cells import Cell
@@ -66,7 +65,6 @@ def run(
 
     After a sweep that is stopped, no other one runs. Raises UserError.
     """
-    make_folder(out)
     results: list[Results] = []
     for number, one in enumerate(chosen):
         results.append(play(one, out / f"{number}-{Path(one.source).stem}"))
