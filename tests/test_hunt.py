@@ -18,7 +18,8 @@ from compose.scenario.kills import KILL_POINTS
 from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep.hunt.coverage import never
-from compose.sweep.hunt.mutation import fault_lines
+from compose.sweep.hunt.examination import examined
+from compose.sweep.hunt.mutation import fault_lines, simpler
 from compose.sweep.hunt.search import Hunt
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.messages import Observation
@@ -55,6 +56,7 @@ def test_a_virtual_process_that_is_not_started_again_is_missed(tmp_path: Path) -
 # --- the search ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_hunt_reaches_the_same_with_any_number_of_jobs() -> None:
     hunts = [Hunt("paper-1", 3, jobs) for jobs in (1, 2)]
     assert [one.run(ended_after(16)) for one in hunts] == [None, None]
@@ -65,24 +67,44 @@ def test_a_hunt_reaches_the_same_with_any_number_of_jobs() -> None:
 
 def steps_twice(real: Any) -> Any:
     def on_observation(self: Any, observation: Observation, frame: bytes) -> bool:
-        if observation == self._observation and self._robot.state.task.name == "orbiting":
+        if observation == self._observation and self._robot.state.task.name == "circling":
             self._robot.observation(observation, frame)
         return bool(real(self, observation, frame))
 
     return on_observation
 
 
+def test_an_input_is_examined_and_a_defect_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = {**scenario_table("paper-1"), "kill": [{"who": "b", "tick": 3, "point": "observation"}]}
+    result = examined(table)
+    assert (result.breaches, result.refused, result.known.ticks) == ((), None, 48)
+    assert {"circling/1/open -> aligning/2/open", "waiting/3/open: log", "end: localised"} <= result.reached
+    monkeypatch.setattr(AgentProcess, "_on_observation", steps_twice(AgentProcess._on_observation))
+    assert [one.kind for one in examined(table).breaches][:1] == ["the recording differs"]
+    assert examined({**table, "seed": -1}).refused is not None
+
+
+def test_the_parts_of_an_input_are_left_out_one_after_the_other() -> None:
+    table = scenario_table("paper-1")
+    worse = {**table, "kill": [{"who": "a", "tick": 3, "after": 1.0}, {"who": "b", "tick": 4}]}
+    left = [one.get("kill") for one in simpler(worse)]
+    assert left[:3] == [[], worse["kill"][1:], worse["kill"][:1]]
+    assert {"planner"} == {name for one in simpler(worse) for name in worse.keys() - one.keys()}
+    assert (fault_lines(worse, table), fault_lines(table, table)) == (2, 0)
+
+
+@pytest.mark.long
 def test_a_hunt_finds_a_defect_and_shrinks_its_input(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(AgentProcess, "_on_observation", steps_twice(AgentProcess._on_observation))
     monkeypatch.chdir(tmp_path)
-    assert command.main(parse(["hunt", "paper-2", "--runs", "200", "-q"])) == 1
-    text = (tmp_path / "hunt-paper-2.toml").read_text()
+    assert command.main(parse(["hunt", "paper-1", "--runs", "200", "-q"])) == 1
+    text = (tmp_path / "hunt-paper-1.toml").read_text()
     assert text.startswith("# the recording differs: agent-")
     found = tomllib.loads(text)
     assert len(found["kill"]) == 1
-    assert fault_lines(found, scenario_table("paper-2")) <= 2
+    assert fault_lines(found, scenario_table("paper-1")) <= 2
     monkeypatch.undo()
-    assert tandem("run", tmp_path / "hunt-paper-2.toml", "-q").status == 0  # without the defect
+    assert tandem("run", tmp_path / "hunt-paper-1.toml", "-q").status == 0  # without the defect
 
 
 # --- the command --------------------------------------------------------------------------------------
