@@ -23,6 +23,8 @@ BATCH = 16
 """The number of inputs that are drawn from one state of the corpus, so that the jobs do not matter."""
 HANG_S = 600.0
 """The time in s after which an input counts as one that never ends."""
+MOST_TRIES = 100
+"""The number of runs in which an input is shrunk at most."""
 PROCESSES_EACH = 100
 """The number of runs after which an input with kills also runs as processes."""
 SEEDS_OF_BATCH = 1
@@ -138,11 +140,13 @@ Examine = Callable[[Sequence[Table]], Iterator[Examined]]
 
 
 def _shrunk(table: Table, breach: Breach, runs: int, jobs: int, examine: Examine) -> Found:
-    """Return the smallest input that breaks the same invariant, from which nothing more can be left out."""
-    left = list(simpler(table))
-    while left:
-        tried, left = left[:jobs], left[jobs:]
+    """Return the smallest input that breaks the same invariant, as far as MOST_TRIES runs show it."""
+    left, tries = list(simpler(table)), 0
+    while left and tries < MOST_TRIES:
+        size = min(jobs, MOST_TRIES - tries)
+        tried, left = left[:size], left[size:]
         for smaller, result in zip(tried, examine(tried), strict=True):
+            tries += 1
             same = next((one for one in result.breaches if one.kind == breach.kind), None)
             if same is not None:
                 table, breach, left = smaller, same, list(simpler(smaller))
