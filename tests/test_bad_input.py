@@ -85,7 +85,8 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
         (
             '"paper"',
             '"papers"',
-            "planner.name: there is no 'papers'; there are assured, paper; did you mean 'paper'?",
+            "planner.name: there is no 'papers'; there are assured, paper, fisher, greedy, random; "
+            "did you mean 'paper'?",
         ),
         (
             'id = "a"',

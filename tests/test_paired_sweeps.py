@@ -34,6 +34,7 @@ OTHER: dict[str, Any] = {
     "kill": [{"who": "a", "tick": 3}],
     "robot.attack": {"kind": "scale", "part": "orbit", "size": 0.9},
     "group.attack": {"kind": "scale", "part": "orbit", "size": 0.9},
+    "team.attack": {"kind": "scale", "size": 0.9},
     "mission.accuracy": 0.3,
     "mission.confidence": 0.99,
     "mission.safety_distance": 0.3,
@@ -125,11 +126,16 @@ def seen(scenario: Scenario) -> list[list[Observation]]:
     return found
 
 
-BASES = {"group.attack": "random-group", "mission.tolerates": "random-group", "mission.survey": "survey"}
+BASES = {
+    "group.attack": "random-group",
+    "mission.tolerates": "random-group",
+    "mission.survey": "survey",
+    "team.attack": "room",
+}
 """The scenarios of the fields that pairs do not have."""
 
 
-@pytest.mark.parametrize("name", ["random", "random-group", "survey"])
+@pytest.mark.parametrize("name", ["random", "random-group", "survey", "room"])
 def test_what_robots_observe_does_not_depend_on_fields_that_the_world_does_not_use(name: str) -> None:
     base = scenario_table(name)
     base["world"] = {"noise": ALL_NOISE, "radio": {"model": "fading"}}
@@ -137,6 +143,9 @@ def test_what_robots_observe_does_not_depend_on_fields_that_the_world_does_not_u
     base["fault"] = [{"loss": 0.3, "delay": [0, 2]}]
     if name == "random":
         base["robot"][1]["anchor"] = [4.0, 0.0]  # in range of each other soon
+    if name == "room":  # all places are drawn
+        base |= {"anchor": [], "robot": [], "team": {"robots": 3, "side": 10.0, "anchors": 4}}
+        base["mission"]["tolerates"] = 1
     as_it_is = seen(validate(base, "base").seeded(7))
     for field, value in OTHER.items():
         if BASES.get(field, "random") != name:

@@ -32,7 +32,7 @@ from tests.commands import tandem
 from tests.uwb_sample import NAMES
 
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
-MAX_SAMPLE_BYTES = 200_000
+MAX_SAMPLE_BYTES = 350_000
 
 TABLES = {
     "odometry": [

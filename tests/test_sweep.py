@@ -960,7 +960,9 @@ def test_a_mistake_in_a_spec_is_one_line_and_status_2(folder: Path) -> None:
 def test_a_spec_that_is_not_there_is_named() -> None:
     ended = tandem("sweep", "nowhere")
     assert ended.status == 2
-    assert ended.err.startswith("tandem sweep: nowhere: neither a file nor a shipped sweep (any-start, ")
+    assert ended.err.startswith(
+        "tandem sweep: nowhere: neither a file nor a shipped sweep (anchors, any-start, "
+    )
 
 
 def test_refused_trials_do_not_make_the_chunks_small(folder: Path) -> None:
