@@ -116,6 +116,17 @@ def test_a_robot_with_three_ranges_keeps_no_other_one_from_its_claim() -> None:
     assert run.end.tick < 30
 
 
+def test_an_anchor_off_its_survey_is_named_before_its_ranges_pass_as_strays() -> None:
+    room = MISSION.replace("5.0", "8.0") + "[team]\nrobots = 2\nanchors = 5\nside = 10.0"
+    table = file_table(parse(f'name = "off"\nseed = 104\n{room}', "off"))
+    x, y = table["anchor"][0]["position"]
+    table["anchor"][0]["stands"] = [x + 0.208, y - 0.216]
+    run = run_mission(replace(template_of(table).scenario, max_ticks=8))
+    assert run.end is not None
+    assert run.end.outcome == "undecided"
+    assert any("anchor A1 seems to stand elsewhere" in (one.text or "") for one in run.end.causes)
+
+
 APART = '[[robot]]\nid = "a"\nstart = [1.0, 1.0, 0.5]\n[[robot]]\nid = "b"\nstart = [9.0, 7.0, 2.0]'
 SCATTERED = team(APART, "", MISSION.replace("0.05", "0.0") + '\nframe = "relative"\ndiameter = 10.0')
 

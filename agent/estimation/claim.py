@@ -244,8 +244,8 @@ BEFORE_SEARCH = (
 )
 """The conditions that a robot asks in each tick. If they hold, it searches the whole plane, and asks all."""
 
-CONDITIONS = (*BEFORE_SEARCH, early_consistency, anchors, profiles, rivals)
-"""All conditions for a claim, cheap ones first."""
+CONDITIONS = (hypothesis, anchors, *BEFORE_SEARCH[1:], early_consistency, profiles, rivals)
+"""All conditions for a claim, cheap ones first: which anchor is displaced has been found out before."""
 
 
 class Blocked(NamedTuple):

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Container, Mapping
 from typing import NamedTuple
 
-from agent.estimation.claim import BEFORE_SEARCH, blocked
+from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, strays
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -40,6 +40,10 @@ With less, claims of robots with many anchors take twice as long; with more, a f
 
 MORE_RANGES = 1.5
 """The factor by which the decisive ranges of a robot must have grown before it is tried again."""
+
+
+DISPLACED = (consistency, strays)
+"""The conditions that an anchor elsewhere than surveyed may be the reason against."""
 
 
 class ClaimRule(NamedTuple):
@@ -145,7 +149,8 @@ class Following(NamedTuple):
             for i, certainty in enumerate(certainties(found))
             if part.robots[i] in asked and not part.is_anchor(i)
         }
-        claiming = {name for name, one in judged.items() if blocked(one, BEFORE_SEARCH) is None}
+        first = {name: blocked(one, BEFORE_SEARCH) for name, one in judged.items()}
+        claiming = {name for name, one in first.items() if one is None or one.condition in DISPLACED}
         displaced, tested = self.displaced, self.tested
         if claiming:
             count = len(part.ranges.rho)

@@ -7,10 +7,13 @@ from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 
-from agent.estimation.fit import Fit
-from agent.estimation.gaussian.consistency import LEAST_INFORMATION
-from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.facts import AnchorPlace
+from agent.estimation.fit import Fit, Start, fits
+from agent.estimation.gaussian.consistency import FINISHED
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, prior_of
+from agent.estimation.gaussian.odometry_noise import track
 from agent.estimation.gaussian.search import FEWEST_DECISIVE, OPEN, beacons, position_sigma
 
 
@@ -19,9 +22,9 @@ class Displacement(NamedTuple):
 
     anchor: str
     vector: tuple[float, float]
-    """The vector in m to the position that they favour, each axis for itself."""
+    """The vector in m to the position that they favour."""
     sigmas: float
-    """The larger of the two in sigmas."""
+    """The length in sigmas."""
 
     @property
     def what(self) -> str:
@@ -30,33 +33,66 @@ class Displacement(NamedTuple):
 
 
 DISPLACED_SIGMAS = 4.0
-"""The score, in sigmas, from which on an anchor stands elsewhere than told.
+"""The distance, in sigmas, from which on an anchor stands elsewhere than told.
 
 Honest anchors of LIAS have at most 1.1 after 40 s, and one that is 0.6 m off has 4.3 to 6.1.
 """
 
 
 def displaced_anchor(fit: Fit, used: JointMeasurements) -> Displacement | None:
-    """Return the anchor that most seems to stand elsewhere; None if none does (score test, Rao 1948).
+    """Return the anchor that most seems to stand elsewhere; None if none does (Wald 1943).
 
-    An anchor with a sigma has its prior at the position that was told; without a position, it has none.
+    The position of each in turn is estimated as if it were not known: then its ranges are no strays, and do
+    not raise the noise level.
     """
-    direction, level = fit.linear.walk.direction, max(fit.level, 1.0)
-    order, most = fit.problem.order, Displacement("", (0.0, 0.0), DISPLACED_SIGMAS)
-    names = np.array([used.radios[one][1] if one >= 0 else "" for one in used.ranges.radio.tolist()])[order]
+    most = Displacement("", (0.0, 0.0), DISPLACED_SIGMAS)
     for name in used.anchors:
-        rows = names == name
-        tested = [fit.linear.score(np.where(rows, -direction[:, axis], 0.0)) for axis in (0, 1)]
-        if (
-            min(information for _, information in tested)
-            <= LEAST_INFORMATION / fit.problem.weighing.longest**2
-        ):
+        measured, k, told = _estimating(name, used)
+        if told.sigma == math.inf:
             continue
-        sigmas = max(abs(score) / math.sqrt(information * level) for score, information in tested)
-        if sigmas > most.sigmas:
-            x, y = [score / information for score, information in tested]
-            most = Displacement(name, (x, y), sigmas)
+        poses, place = fit.start.poses, np.array((told.x, told.y))
+        starts = poses if k < len(poses) else np.vstack((poses, (*place, 0.0)))
+        for free in fits(measured, [Start(starts, fit.start.errors)]):
+            own = slice(3 * k, 3 * k + 2)
+            away = free.poses[k, :2] - place
+            spread = free.covariance[own, own] + told.sigma**2 * np.eye(2)
+            (xx, xy), (_, yy) = spread.tolist()
+            x, y = away.tolist()
+            square, area = yy * x * x - 2.0 * xy * x * y + xx * y * y, xx * yy - xy * xy
+            sigmas = math.sqrt(square / area) if min(square, area) > 0.0 else 0.0
+            if sigmas > most.sigmas and free.last_step <= FINISHED:
+                most = Displacement(name, (x, y), sigmas)
     return most if most.anchor else None
+
+
+def _estimating(name: str, used: JointMeasurements) -> tuple[JointMeasurements, int, AnchorPlace]:
+    """Return the measurements as if an anchor were told to R only, its place in them, and what was told."""
+    robots, ranges, n = used.robots, used.ranges, len(used.robots)
+    surveyed = used.surveyed or (None,) * n
+    k = robots.index(name) if name in robots else n
+    told = surveyed[k] if k < n else None
+    if told is None:
+        radios = np.array([one for one, ends in enumerate(used.radios) if ends[1] == name])
+        rows = np.isin(ranges.radio, radios) & (ranges.second < 0)
+        told = AnchorPlace(*ranges.place[np.argmax(rows)].tolist())
+        still = np.zeros(max([len(path.v) for path in used.paths]))
+        ranges = replace(
+            ranges, second=np.where(rows, k, ranges.second), place=np.where(rows[:, None], 0.0, ranges.place)
+        )
+        used = replace(
+            used,
+            robots=(*robots, name),
+            ranges=ranges,
+            paths=(*used.paths, track(still, still, used.period)),
+            surveyed=(*surveyed, told),
+        )
+    size = len(used.robots)
+    mean, information = np.zeros((size, 3)), np.zeros((3 * size, 3 * size))
+    if used.prior is not None:
+        mean[:n], information[: 3 * n, : 3 * n] = used.prior.mean, used.prior.information
+    mean[k, :2] = told.x, told.y
+    information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.diag((used.reach**-2, used.reach**-2, 1.0))
+    return replace(used, prior=prior_of(mean, information), solver=None), k, told
 
 
 def decisive_ranges(robot: int, used: JointMeasurements) -> int:

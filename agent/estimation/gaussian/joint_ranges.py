@@ -147,10 +147,13 @@ class PosePrior(NamedTuple):
         """Return the prior of the `chosen` robots, of which nothing is known together with others."""
         own = np.add.outer(3 * np.array(chosen, np.intp), np.arange(3)).ravel()
         information = self.information[np.ix_(own, own)]
-        known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()
-        if not known:
-            return None
-        return PosePrior(self.mean[list(chosen)], information, len(known), sum(map(math.log, known)))
+        return prior_of(self.mean[list(chosen)], information) if np.diagonal(information).any() else None
+
+
+def prior_of(mean: Array, information: Array) -> PosePrior:
+    """Return the prior of poses of which nothing is known together."""
+    known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()
+    return PosePrior(mean, information, len(known), sum(map(math.log, known)))
 
 
 class Silence(NamedTuple):
@@ -567,8 +570,7 @@ def _prior(poses: Sequence[AnchorPlace | StartPose | None], of_start: float) -> 
                 mean[k], told = one, (of_start**-2, of_start**-2, of_start**-2)
         if told is not None:
             information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.diag(told)
-    known = np.diagonal(information)[np.diagonal(information) > 0.0].tolist()
-    return PosePrior(mean, information, len(known), sum(map(math.log, known)))
+    return prior_of(mean, information)
 
 
 def _path(steps: Sequence[Manoeuvre], period: float) -> Track:
