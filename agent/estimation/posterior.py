@@ -176,10 +176,7 @@ def ended(found: Posterior, measured: JointMeasurements) -> Posterior:
         return found
     part, nu, fitted = measured.some(found.located), measured.noise.sigma_degrees, []
     for one in found.hypotheses:
-        if one.fit.last_step <= FAR_OFF:
-            fitted.append(one.fit)
-            continue
-        for fit in fits(part, [one.fit.start], PATIENT):
+        for fit in fits(part, [one.fit.start], PATIENT) if one.fit.last_step > FAR_OFF else [one.fit]:
             chi2 = fit.chi2 + (fit.last_step**2 * fit.level if fit.last_step > FAR_OFF else 0.0)
             before, after = [misfit_log_likelihood(each, fit.freedom, nu) for each in (fit.chi2, chi2)]
             fitted.append(fit._replace(chi2=chi2, weight=fit.weight + after - before))

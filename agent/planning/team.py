@@ -167,10 +167,6 @@ class TeamState(msgspec.Struct, frozen=True):
         """The other robots that have no result, as far as this one knows."""
         return [one for one in range(len(self.team.robots)) if one not in {*self.log.done, self.own}]
 
-    def has_met(self, robot: int) -> bool:
-        """Return whether measurements connect this robot with another one."""
-        return bool(self.log.logs[robot]) or self.nearest[robot].range < math.inf
-
 
 class TeamPlanner(Planner[TeamState, TeamReport]):
     """The planner `assured` of a team."""
@@ -425,7 +421,7 @@ def _moved_on(state: TeamState) -> TeamState:
     if isinstance(state.verdict, Undecided) or (state.verdict is not None and not state.waiting):
         name = "undecided" if isinstance(state.verdict, Undecided) else "localised"
         return replace(state, doing=name, phase=3, controls=REST)
-    if state.team.diameter and state.waiting and not any(map(state.has_met, _to_meet(state))):
+    if state.team.diameter and state.waiting and _alone(state):
         return _searching(state)
     if state.doing == "homing" and state.peers:  # what it did after the first return has led away again
         until = state.tick + 2 * loop_ticks(mission, own) if state.returned >= 0 else -1
@@ -452,10 +448,11 @@ def _moved_on(state: TeamState) -> TeamState:
     return replace(state, doing="orbiting", phase=2, controls=_along(state, state.way))
 
 
-def _to_meet(state: TeamState) -> list[int]:
-    """Return the robots of which one is met before this robot moves as in other teams."""
-    origin = state.team.robots.index(state.team.origin or "")
-    return state.waiting if origin == state.own else [origin]
+def _alone(state: TeamState) -> bool:
+    """Return whether nothing connects this robot with the first, or the first with one that is waiting."""
+    first = state.team.robots.index(state.team.origin or "")
+    others = state.waiting if first == state.own else [first]
+    return not any(state.log.logs[one] or state.nearest[one].range < math.inf for one in others)
 
 
 def _searching(state: TeamState) -> TeamState:
