@@ -711,10 +711,7 @@ class Estimate(Message, frozen=True):
     robot: RobotId
     """The sender."""
     local: tuple[Pose, ...]
-    """The possible poses in the robot's anchor frame, one for each remaining branch: m, m and rad.
-
-    In a team, the pose in the frame of the one at tick 0, once the robot is located.
-    """
+    """The possible poses in the robot's anchor frame, in a team in that of its start: m, m and rad."""
     world: tuple[Pose, ...]
     """The possible poses in <W>, one for each remaining placement: m, m and rad."""
     localised: bool
