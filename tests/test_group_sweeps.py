@@ -103,6 +103,8 @@ def test_the_robot_r1_of_a_drawn_group_may_have_an_attack() -> None:
         ("group-attacks-noise-tolerated", True),
         ("anchors", True),
         ("relative", True),
+        ("survey", True),
+        ("team-attacks", True),
         ("loss", False),
     ],
 )
