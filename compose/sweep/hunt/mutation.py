@@ -24,8 +24,8 @@ from protocol import attack
 Table = dict[str, Any]
 """The content of a scenario file."""
 
-ROBOT_NAMES = ("a", "A", "b", "B", "aa", "a-b", "a_b", "r1", "r10", "R1", "0", "00", "World")
-"""Names of robots that something which compares them wrongly may confuse."""
+ALIKE = (("a", "A"), ("r1", "R1"), ("r1", "r10"), ("a", "aa"), ("a-b", "a_b"), ("0", "00"), ("World", "w"))
+"""Names of two robots that something which compares them wrongly may confuse."""
 RANGE_SIGMAS = (0.001, 0.01, 0.05, 0.1)
 """The sigmas in m of ranges that are drawn."""
 MOST_FAULTS, MOST_KILLS = 5, 16
@@ -184,9 +184,11 @@ def _planner(table: Table, _known: Known, draw: random.Random) -> Table:
 def _names(table: Table, _known: Known, draw: random.Random) -> Table | None:
     """Give the robots other names."""
     robots = table.get("robot", [])
-    if not 2 <= len(robots) <= len(ROBOT_NAMES):
+    if len(robots) < 2:
         return None
-    names = dict(zip([one["id"] for one in robots], draw.sample(ROBOT_NAMES, len(robots)), strict=True))
+    given = [one["id"] for one in robots]
+    others = [f"x{i}" for i in range(len(robots) - 2)]
+    names = dict(zip(given, draw.sample([*draw.choice(ALIKE), *others], len(given)), strict=True))
     for robot in robots:
         robot |= {name: names[robot[name]] for name in ("id", "peer") if name in robot}
     for kill in table.get("kill", []):
