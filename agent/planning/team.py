@@ -57,6 +57,11 @@ LOOPS_UNTIL_RETURN = 3
 
 UNMET = "it has reported nothing"
 """The reason against a claim by the measurements of a robot that there are none of."""
+MANY_RETURNS = 2
+"""The number of returns to a contact after which what the robot does there has led away too often.
+
+With less, missions in which the next ranges would suffice take longer by these loops.
+"""
 LAPS = (0.0, 0.5, -0.5, 1.0, -1.0)
 """The distances by which consecutive laps of the way past an anchor lie outside it, in units of R."""
 
@@ -136,10 +141,10 @@ class TeamState(msgspec.Struct, frozen=True):
     verdict: Verdict | None = None
     way: Way | None = None
     """The way past an anchor; None until it has none."""
-    returned: int = -1
-    """The tick of the latest return to a contact; -1 before the first."""
+    returns: int = 0
+    """The number of returns to a contact."""
     loops_until: int = -1
-    """The tick until which it drives loops there, since it was there before."""
+    """The tick until which it drives loops there, after MANY_RETURNS."""
     spiral: Spiral = Spiral()
     """The search for robots that start elsewhere."""
     doing: str = "asleep"
@@ -423,9 +428,6 @@ def _moved_on(state: TeamState) -> TeamState:
         return replace(state, doing=name, phase=3, controls=REST)
     if state.team.diameter and state.waiting and _alone(state):
         return _searching(state)
-    if state.doing == "homing" and state.peers:  # what it did after the first return has led away again
-        until = state.tick + 2 * loop_ticks(mission, own) if state.returned >= 0 else -1
-        state = replace(state, returned=state.tick, loops_until=until)
     if state.tick < state.loops_until:
         return replace(state, doing="circling", phase=1, controls=loop(mission, own, state.tick))
     lost = [state.nearest[one].place for one in state.waiting if state.nearest[one].range < math.inf]
@@ -435,6 +437,9 @@ def _moved_on(state: TeamState) -> TeamState:
     if state.verdict is None and (place := _lost(state)) is not None:
         back = towards((place.x, place.y), state.odometry, mission, ARRIVED)
         return replace(state, doing="homing", phase=1, controls=back or REST, following=Following())
+    if state.doing == "homing":
+        until = state.tick + 2 * loop_ticks(mission, own) if state.returns >= MANY_RETURNS else -1
+        state = replace(state, returns=state.returns + 1, loops_until=until)
     if state.verdict is not None and state.config.robot != state.team.origin:
         return replace(
             state, doing="localised", phase=3, controls=loop(mission, own, state.tick) if waiting else REST
