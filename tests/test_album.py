@@ -432,6 +432,7 @@ def _turned(frame: bytes, tick: int) -> bytes:
 # --- the command ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_terminal_shows_how_far_it_is_and_each_file_on_a_line_of_its_own(
     recordings: Path, tmp_path: Path
 ) -> None:

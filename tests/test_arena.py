@@ -114,6 +114,7 @@ def test_the_derivatives_with_which_baselines_plan_are_those_of_the_ranges() -> 
     assert ((beyond > 0.0) == (ranges(poses) > NEAR * MISSION.sensing_range).any(-1)).all()
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("name", series(["fisher", "greedy", "random"]))
 def test_a_baseline_is_a_planner_by_its_name_and_breaks_no_rule(name: str) -> None:
     assert name in BASELINES

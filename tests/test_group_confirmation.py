@@ -129,6 +129,7 @@ def test_a_robot_that_knows_a_pose_says_that_it_is_unconfirmed_and_makes_no_clai
     assert any(one.state == "unconfirmed" and one.verdict is None for one in bodies)
 
 
+@pytest.mark.long
 def test_honest_robots_claim_right_poses_in_a_group_with_an_attacker() -> None:
     assert honest(run_mission(scenario_with(3, TURNED))) == (3, 0, 0)
 

@@ -193,6 +193,7 @@ def mission(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.long
 def test_a_recorded_mission_of_a_group_is_estimated_by_default_with_all_robots(mission: Path) -> None:
     ran = tandem("estimate", "recording", "--noise", "group.toml", "--out", "estimated", cwd=mission)
     assert ran.status == ENDED, ran.out + ran.err

@@ -56,6 +56,7 @@ def test_any_msgpack_library_reads_a_journal(tmp_path: Path) -> None:
     assert msgpack.unpackb(frames[2][5:])[:3] == ["command", 0, "a"]
 
 
+@pytest.mark.long
 def test_a_journal_cut_anywhere_reads_back_every_whole_frame(tmp_path: Path) -> None:
     data = written(tmp_path / "whole", FRAMES)
     ends = [len(b"".join(msgpack.packb(frame) for frame in FRAMES[:i])) for i in range(len(FRAMES) + 1)]

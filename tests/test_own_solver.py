@@ -56,6 +56,7 @@ def test_measurements_with_another_solver_are_others() -> None:
     assert replace(measured, solver=one) != replace(measured, solver=Smoother())
 
 
+@pytest.mark.long
 def test_a_robot_whose_solver_finds_nothing_claims_nothing() -> None:
     run = tandem.run("noisy", planner=WithNothing)
     assert run.outcome == "undecided"

@@ -102,6 +102,7 @@ def test_without_the_ground_truth_nothing_is_known_to_be_false(recording: Path, 
 # --- the page -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_card_names_the_gap_and_then_the_verdict_and_only_with_the_truth(
     opened: Open, recording: Path, attacked_address: str
 ) -> None:
@@ -133,6 +134,7 @@ def test_the_card_names_the_gap_and_then_the_verdict_and_only_with_the_truth(
     assert not [text for text in page.evaluate(LABELS) if "reported" in text]
 
 
+@pytest.mark.long
 def test_the_path_that_an_attacker_reports_is_drawn_in_the_hue_that_the_legend_gives_it(
     opened: Open, recording: Path, attacked_address: str
 ) -> None:

@@ -192,6 +192,7 @@ def until_read(page: Page, tick: int) -> None:
     expect(page.locator(CHARTS)).to_have_attribute("aria-label", re.compile(f"^Tick {tick}. hypotheses"))
 
 
+@pytest.mark.long
 def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
     opened: Open, served: str, noisy: Path
 ) -> None:

@@ -30,6 +30,7 @@ def target(page: Page, kind: str, robot: str, place: int | None = None) -> tuple
     return box["x"] + at[0], box["y"] + at[1]
 
 
+@pytest.mark.long
 def test_hovering_shows_the_numbers_and_a_click_selects_until_escape(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=47")
     until_shown(page, 47)

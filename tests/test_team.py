@@ -227,6 +227,7 @@ EXACT = MISSION.replace("\nnoise =", "\n# noise =")
 RADIUS, SCALE = '"radius", size = 0.5', '"scale", size = 0.3'
 
 
+@pytest.mark.long
 @pytest.mark.parametrize(
     "case", series([(RADIUS, MISSION), (SCALE, EXACT), (RADIUS, EXACT), (SCALE, MISSION)], 1)
 )
