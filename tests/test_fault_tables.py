@@ -202,6 +202,7 @@ def test_an_invalid_fault_is_quoted_with_its_error(said: str, says: str) -> None
 def test_a_mistake_about_faults_is_one_line_and_status_2(tmp_path: Path) -> None:
     refused(tandem("run", "random", "--fault", "a->b: loss=2"), "--fault 'a->b: loss=2': loss: ")
     refused(tandem("run", "random", "--fault", "two\nlines=1"), "unknown field 'two")
+    refused(tandem("run", "random", "--fault", "a->b loss=1"), "'a->b loss' has no colon after its link")
     listen = ("--listen", "tcp/127.0.0.1:7447")
     refused(tandem("world", "random", *listen, "--fault", "x->y: loss=1"), "'x' and 'y' are not a pair")
     refused_scenario(RANDOM + "[[fault]]\ndelay = [5, 2]\n", tmp_path, "fault[0].delay: the lower bound 5")

@@ -284,7 +284,7 @@ BROKEN = {
     "Unpicklable": ("equal arguments", "its state cannot be pickled"),
     "Fast": ("the audit", "it commanded v = 1.5, expected at most 1"),
     "Stranger": ("it completes", "command() at tick 0 returns the peer nobody, expected b"),
-    "NotANumber": ("it completes", "command() at tick 5 its Command cannot be sent"),
+    "NotANumber": ("it completes", "command() at tick 5: its Command cannot be sent: v: "),
     "Talkative": ("it completes", "its report has 5"),
     "Undecodable": ("it completes", "its report cannot be sent: its body: Expected `int`"),
     "Gullible": ("no report", "a false report that its decoder takes"),

@@ -475,7 +475,12 @@ INVALID: list[tuple[str, int, dict[str, object], str]] = [
     ("odometry", 1, {"sigma_dx": 0.1}, "it needs all of sigma_dx, sigma_dy, sigma_dheading, or none"),
     ("ranges", 1, {"range": -1.5}, "range: expected a number >= 0.0, got '-1.5'"),
     ("ranges", 1, {"sigma": 0}, "sigma: expected a number > 0.0, got '0'"),
-    ("ranges", 1, {"from": "M2"}, "M2 is neither a robot with odometry nor a known anchor"),
+    (
+        "ranges",
+        1,
+        {"from": "M2"},
+        "M2 is neither a robot with odometry nor a known anchor; did you mean 'M1'?",
+    ),
     ("ranges", 1, {"to": "M1"}, "it is a range from M1 to itself"),
     ("ranges", 1, {"from": "b"}, "t: it is of 0.2 s, and the range between b and a before it is of 0.3 s"),
     ("antennas", 0, {"robot": "c"}, "robot: c has no odometry"),
@@ -515,7 +520,7 @@ def test_an_invalid_row_is_one_line_with_its_place(
         ("EDGE_SE2 1 A0 A1 0 0 0 1 nan 0 1 0 1", ", line 1: cov_xy: 'nan' is not a number"),
         (
             "VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 B0 1 1",
-            ", line 2: B is neither a robot with odometry nor a",
+            ", line 2: B is neither a robot with odometry nor a known anchor; the recording has no anchors",
         ),
         ("VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 L0 1 0", ", line 2: variance: 0 is not positive"),
         (

@@ -7,9 +7,9 @@ from pathlib import Path
 
 from compose.cli.export_files import EXPORT_MODULES, exported
 from compose.cli.recording import note, read_noted
-from compose.errors import ENDED, FAILED, writing
+from compose.errors import ENDED, FAILED, UserError, writing
 from compose.extras import need
-from compose.recording.recording_files import journals_in, make_folder, user_errors
+from compose.recording.recording_files import WORLD_JOURNAL, journals_in, make_folder, user_errors
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
@@ -74,6 +74,9 @@ def _tum(recording: Path, out: Path) -> None:
     with user_errors(recording):
         if (recording / ESTIMATE_CSV).exists() and not journals_in(recording):
             texts = tum_of_estimate(recording)
+        elif recording.is_dir() and not journals_in(recording):
+            neither = f"there is no {WORLD_JOURNAL} and no {ESTIMATE_CSV}"
+            raise UserError(f"{recording} contains no recording and no estimate: {neither}")
         else:
             texts = tum_of_run(read_noted(recording, "export"))
     for name, text in texts.items():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import traceback
 from collections.abc import Callable
 from pathlib import Path
@@ -18,6 +19,15 @@ from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 ANSWERS = {"command": Command, "estimate": Estimate, "summary": Summary, "rendezvous": Rendezvous}
 """The types of the answers, by method."""
+
+
+def _field_first(error: str, kind: type[msgspec.Struct]) -> str:
+    """Return msgspec's `error` about a message of this kind with the name of the field in front."""
+    match = re.fullmatch(r"(.*) - at `\$\[(\d+)\].*`", error, re.DOTALL)
+    place = int(match[2]) - 1 if match is not None else -1  # the first element is the tag
+    if match is None or not 0 <= place < len(kind.__struct_fields__):
+        return error
+    return f"{kind.__struct_fields__[place]}: {match[1].replace('`', chr(39))}"
 
 
 def _guarded(method: str) -> Any:
@@ -107,7 +117,8 @@ class GuardedPlanner(Planner[Any, Any]):
             try:
                 decode(encode(found), kind)
             except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
-                raise self._failed(method, f"its {kind.__name__} cannot be sent: {error}") from None
+                why = _field_first(str(error), kind)
+                raise self._failed(method, f"its {kind.__name__} cannot be sent: {why}") from None
             self._check_address(method, found)
         if isinstance(found, Command) and found.peer not in (None, *self._others):
             raise self._failed(method, f"returns the peer {found.peer}, expected {' or '.join(self._others)}")
@@ -131,4 +142,5 @@ class GuardedPlanner(Planner[Any, Any]):
 
     def _failed(self, method: str, what: str) -> PlannerFailed:
         tick = f" at tick {self._tick}" if self._tick is not None else ""
-        return PlannerFailed(f"the planner {self._name}: {method}(){tick} {what}")
+        colon = ":" if what.startswith("its ") else ""
+        return PlannerFailed(f"the planner {self._name}: {method}(){tick}{colon} {what}")

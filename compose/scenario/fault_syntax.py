@@ -87,6 +87,8 @@ def table_of(text: str) -> dict[str, Any]:
         name, equals, value = (piece.strip() for piece in part.partition("="))
         if not name:
             raise BadFault(f"'{text}' has an empty entry; expected the form a->b: loss=0.3, delay=0..3")
+        if "->" in name:
+            raise BadFault(f"'{name}' has no colon after its link; expected the form a->b: loss=0.3")
         if name in table:
             raise BadFault(f"{name}: given twice")
         table[name] = _value(name, value) if equals else True

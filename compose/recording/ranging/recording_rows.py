@@ -26,6 +26,7 @@ from compose.recording.ranging.range_recording import (
     locked,
 )
 from protocol.motion import Pose, heading_of, relative, wrap
+from protocol.spelling import did_you_mean
 from protocol.units import Angle, Coordinate, Range, RobotId, Sigma
 
 Stamp = Annotated[float, Meta(ge=-1e12, le=1e12)]
@@ -360,6 +361,12 @@ class RecordingBuilder:
             tuple(self._jumps.get(name, ())),
         )
 
+    def _unknown(self, name: str, names: Sequence[str]) -> str:
+        what = "is neither a robot with odometry nor a known anchor"
+        if len(names) == len(self._odometry):
+            return f"{what}; the recording has no anchors"
+        return f"{what}{did_you_mean(name, names)}"
+
     def _range_series(self, names: Sequence[str]) -> RangeSeries:
         radios = {name: i for i, name in enumerate(names)}
         robots = len(self._odometry)
@@ -367,7 +374,7 @@ class RecordingBuilder:
         for i, (row, place) in enumerate(self._ranges):
             for name in (row.first, row.second):
                 if name not in radios:
-                    raise BadRecording(f"{place}: {name} is neither a robot with odometry nor a known anchor")
+                    raise BadRecording(f"{place}: {name} {self._unknown(name, names)}")
             ends[i] = radios[row.first], radios[row.second]
             if min(ends[i]) >= robots:
                 raise BadRecording(f"{place}: {row.first} and {row.second} are both anchors")
