@@ -268,7 +268,7 @@ COMMANDS = (
         *("tandem hunt random --minutes 5", "docs/howto-hunt.md"),
         f"""{SCENARIO}
         --minutes M = 5: wall time of the search in minutes [default: %(default)g]
-        | --runs N: number of runs instead, after which it ends
+        | --runs N: number of runs instead, in batches of 16, after which it ends
         --jobs N: processes in which missions run, 1 to 1000 [default: one per core]
         --seed N = 0: seed of all draws, 0 to 2^63 - 1 [default: %(default)s]
         --out FILE: scenario file that is written if something is found [default: hunt-SCENARIO.toml]
