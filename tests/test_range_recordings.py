@@ -478,8 +478,8 @@ INVALID: list[tuple[str, int, dict[str, object], str]] = [
     (
         "ranges",
         1,
-        {"from": "M2"},
-        "M2 is neither a robot with odometry nor a known anchor; did you mean 'M1'?",
+        {"from": "M12"},
+        "M12 is neither a robot with odometry nor a known anchor; did you mean 'M1'?",
     ),
     ("ranges", 1, {"to": "M1"}, "it is a range from M1 to itself"),
     ("ranges", 1, {"from": "b"}, "t: it is of 0.2 s, and the range between b and a before it is of 0.3 s"),
