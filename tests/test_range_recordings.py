@@ -640,6 +640,24 @@ def test_odometry_as_poses_that_begin_anywhere_gives_the_increments(headings: st
     )
 
 
+@pytest.mark.parametrize("headings", ["unwrapped", "wrapped"])
+def test_headings_in_degrees_are_named(headings: str, tmp_path: Path) -> None:
+    rows = track(headings=headings, begin=Pose(400.0, -70.0, 3.0))
+    tables = {"poses": rows, "anchors": TABLES["anchors"]}
+    tables["ranges"] = [{"t": 0.3, "from": "a", "to": "M1", "range": 2.5}]
+    read_ranges(written_csv(tmp_path / "rad", tables))
+    tables["poses"] = [row | {"heading": math.degrees(float(str(row["heading"])))} for row in rows]
+    said = refused(written_csv(tmp_path / "degrees", tables))
+    what = "the headings of a agree with its motion only as degrees"
+    assert said == f"{tmp_path}/degrees: {what}: are they in degrees? They have to be in rad"
+
+
+def test_columns_that_semicolons_separate_are_named(tmp_path: Path) -> None:
+    folder = written_csv(tmp_path, TABLES)
+    (folder / "ranges.csv").write_text("t;from;to;range\n0;a;M1;2.5\n")
+    assert refused(folder).endswith("it has t, from, to, range, sigma; commas separate columns")
+
+
 def test_a_tum_file_gives_the_poses_of_a_csv_file(tmp_path: Path) -> None:
     rows, ranges = track(headings="quaternion", begin=Pose(4.0, 2.0, -1.0)), TABLES["ranges"][1:]
     tables = {"poses": rows, "truth": rows, "ranges": ranges, "anchors": TABLES["anchors"]}

@@ -117,7 +117,7 @@ class GuardedPlanner(Planner[Any, Any]):
             try:
                 decode(encode(found), kind)
             except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
-                why = _field_first(str(error), kind)
+                why = _field_first(str(error), type(found))
                 raise self._failed(method, f"its {kind.__name__} cannot be sent: {why}") from None
             self._check_address(method, found)
         if isinstance(found, Command) and found.peer not in (None, *self._others):

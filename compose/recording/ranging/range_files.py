@@ -166,6 +166,8 @@ def _check_head(head: list[str], kind: type[Row], place: SourcePlace) -> None:
             guess = did_you_mean(name, known)
             if kind is OdometryRow and name in PoseRow.__struct_fields__:
                 guess = "; poses are in poses.csv"
+            if len(head) == 1 and any(one in name for one in ";\t"):
+                guess = "; commas separate columns"
             raise BadRecording(f"{place}: unknown column {name[:40]!a}; it has {', '.join(known)}{guess}")
         if head.count(name) > 1:
             raise BadRecording(f"{place}: there are two columns {name}")

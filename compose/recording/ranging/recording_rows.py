@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import cmath
+import math
 import re
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -165,6 +167,8 @@ TABLES: dict[str, type[AnyRow]] = {
 """The rows of each table, by its name."""
 Covariance6 = tuple[float, float, float, float, float, float]
 """The upper triangle of a covariance of (dx, dy, dheading), row by row."""
+AGREEING = 0.9
+"""The part of the way from which on it is along the headings. Those of another unit have less than half."""
 UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """The place in a Covariance6 of each element of the matrix."""
 
@@ -215,6 +219,8 @@ class RecordingBuilder:
         self._jumps: dict[str, list[Jump]] = {}
         self._truth: dict[str, list[TimedPose]] = {}
         self._poses: dict[str, TimedPose] = {}
+        self._courses: dict[str, tuple[float, complex, complex]] = {}
+        """The way (m) of each robot with poses, and its sums along the headings: in rad, as if in degrees."""
         self._given = {row.anchor: row for row in anchors}
         self._anchors: dict[str, AnchorRow] = {}
         self._antennas: dict[str, AntennaRow] = {}
@@ -283,8 +289,26 @@ class RecordingBuilder:
         pose = self._poses[row.robot] = _after(before, row, f"pose of {row.robot}", place)
         self.add_robot(row.robot)
         if before is not None and pose != before:
+            self._add_course(row.robot, before.pose, pose.pose)
             dx, dy, turn = astuple(relative(before.pose, pose.pose))
             self.add_odometry(OdometryRow(row.robot, before.t, row.t, dx, dy, wrap(turn)), None, place)
+
+    def _add_course(self, robot: str, start: Pose, end: Pose) -> None:
+        """Add a way to the sums. Its direction relative to the heading is doubled: a robot may back up."""
+        way, sums = complex(end.x - start.x, end.y - start.y), []
+        for unit in (1.0, math.radians(1.0)):
+            heading = unit * start.heading + wrap(unit * (end.heading - start.heading)) / 2.0
+            along = way * cmath.exp(-1j * heading)
+            sums.append(along**2 / abs(along) if along else 0j)
+        length, radians, degrees = self._courses.get(robot, (0.0, 0j, 0j))
+        self._courses[robot] = length + abs(way), radians + sums[0], degrees + sums[1]
+
+    def _check_headings(self) -> None:
+        """Raise BadRecording if the headings of a robot agree with its motion as degrees only."""
+        for robot, (length, radians, degrees) in self._courses.items():
+            if abs(degrees) > AGREEING * length > 2.0 * abs(radians):
+                what = f"the headings of {robot} agree with its motion only as degrees"
+                raise BadRecording(f"{self.source}: {what}: are they in degrees? They have to be in rad")
 
     def _add_jump(self, row: OdometryRow, before: float, place: object) -> None:
         """Note an increment that lasts, or begins after the time `before` by, more than LONGEST_GAP_S."""
@@ -333,6 +357,7 @@ class RecordingBuilder:
             dict(self.unused),
         )
         self._check_times(recording)
+        self._check_headings()
         return recording
 
     def _check_times(self, recording: RangeRecording) -> None:
