@@ -30,7 +30,7 @@ NO_RANGE = -1.0
 """The element of an observation for a beacon that is out of range."""
 
 
-class Environment(ParallelEnv[str, Array, Array]):  # type: ignore[misc]  # it has no types
+class MissionEnvironment(ParallelEnv[str, Array, Array]):  # type: ignore[misc]  # it has no types
     """The robots of a scenario as agents that choose (v, omega), until all have claimed their poses.
 
     Measurements are shared and poses claimed as in a team: each robot estimates from what it has measured and

@@ -20,7 +20,7 @@ from world.tick import advance, observations, release
 if TYPE_CHECKING:
     from numpy.typing import NDArray
 
-    from tandem.environments import Environment
+    from tandem.environments import MissionEnvironment
 
 
 class World:
@@ -123,7 +123,7 @@ class World:
 
 def parallel_env(
     scenario: Scenario | str | Path | Mapping[str, Any], *, seed: int | None = None
-) -> Environment:
+) -> MissionEnvironment:
     """Return a PettingZoo `ParallelEnv` in which a policy drives the robots of `scenario`.
 
     `seed` is that of the first mission, by default that of the scenario. Raises UserError for invalid
@@ -136,7 +136,7 @@ def parallel_env(
     {'a': -1.0, 'b': -1.0}
     """
     need("gymnasium", "pettingzoo", extra="rl")
-    from tandem.environments import Environment  # noqa: PLC0415  # optional
+    from tandem.environments import MissionEnvironment  # noqa: PLC0415  # optional
 
     chosen = scenario_of(scenario)
-    return Environment(chosen if seed is None else chosen.with_(seed=seed))
+    return MissionEnvironment(chosen if seed is None else chosen.with_(seed=seed))

@@ -24,8 +24,8 @@ from agent.planning import accuracy_seeking
 from agent.process import node
 from compose.recording import run
 from compose.scenario import group_meetings
+from compose.sweep.hunt.exploration import FoundBreach, Hunt
 from compose.sweep.hunt.mutation import fault_lines
-from compose.sweep.hunt.search import Found, Hunt
 from protocol.journal.journal_file import Journal
 from world import scenario, tick
 
@@ -181,7 +181,7 @@ def hunted(mutant: Callable[[], None], source: str, cpu_s: float, *, guided: boo
         spent = used()
         return spent > cpu_s
 
-    found: Found | None = hunt.run(is_over)
+    found: FoundBreach | None = hunt.run(is_over)
     if found is None:
         return f"not found in {hunt.runs} runs, {spent:.0f} s"
     changes = fault_lines(found.table, hunt.seeds[0])

@@ -11,12 +11,12 @@ import numpy as np
 import pytest
 
 import tandem
-from tandem.environments import NO_RANGE, Environment
+from tandem.environments import NO_RANGE, MissionEnvironment
 
 pettingzoo_test = pytest.importorskip("pettingzoo.test")
 
 
-def driven(env: Environment, run: tandem.Run) -> tuple[list[dict[str, Any]], Mapping[str, Any]]:
+def driven(env: MissionEnvironment, run: tandem.Run) -> tuple[list[dict[str, Any]], Mapping[str, Any]]:
     """Return the observations of all ticks with the commands of `run`, and then rest; and the last infos."""
     infos: Mapping[str, Any]
     first, infos = env.reset(seed=run.seed)

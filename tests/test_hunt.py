@@ -18,8 +18,8 @@ from compose.scenario.kills import KILL_POINTS
 from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep.hunt.examination import examined
+from compose.sweep.hunt.exploration import Hunt
 from compose.sweep.hunt.mutation import fault_lines, simpler
-from compose.sweep.hunt.search import Hunt
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.messages import Observation
 from tests.commands import TandemProcess, tandem

@@ -69,7 +69,9 @@ def signalled(module: str, number: Signals, *words: str | Path) -> Ended:
     return program(SIGNALLED.replace("MODULE", module).replace("SIGNAL", number.name), *words)
 
 
-@pytest.mark.parametrize("module", series(["argparse", "tandem.clash", "compose.cli.main", "msgspec"], 2))
+@pytest.mark.parametrize(
+    "module", series(["argparse", "tandem.clash", "compose.cli.main", "compose.cli.commands"], 2)
+)
 def test_ctrl_c_while_tandem_starts_ends_it_without_output(module: str) -> None:
     assert signalled(module, SIGINT, "scenarios") == (130, "", "")
 

@@ -222,7 +222,8 @@ def test_a_planner_of_an_installed_package_has_a_name(tmp_path: Path) -> None:
     assert ran("audit", out, "--planner", "glean").returncode == 0
     wrong = ran("run", "paper-1", "--planner", "glaen", "--in-process")
     assert wrong.returncode == 2
-    assert "there is no 'glaen'; there are assured, paper, glean; did you mean 'glean'?" in wrong.stderr
+    assert "there is no 'glaen'; there are assured, paper, glean, fisher, greedy, random; " in wrong.stderr
+    assert "did you mean 'glean'?" in wrong.stderr
     assert "glean" in ran("scenarios", "--schema", "scenario").stdout
 
 

@@ -9,20 +9,20 @@ from typing import NamedTuple
 from msgspec.structs import astuple, replace
 
 from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRange, StartPose
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, Row, of_rows
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, MeasuredRow, of_rows
 from agent.peer.team_log import Entry, TeamLog
 from protocol.messages import Team
 from protocol.mission import Mission
 
 
 class TeamMeasurements(NamedTuple):
-    """What has been read of a team's log."""
+    """The part of a team's log that has been read."""
 
     read: tuple[int, ...] = ()
     """The number of entries of each robot."""
     steps: Mapping[str, tuple[Manoeuvre, ...]] = {}
     """The manoeuvres of each robot of which there is a measurement."""
-    rows: Mapping[tuple[bool, str, str, int], Row] = {}
+    rows: Mapping[tuple[bool, str, str, int], MeasuredRow] = {}
     """The ranges. Both robots measure the same one between them: that of the first in the team counts."""
 
     def grown(self, log: TeamLog, team: Team, mission: Mission) -> TeamMeasurements:
@@ -64,14 +64,16 @@ class TeamMeasurements(NamedTuple):
         return measured.thinned(reach)
 
 
-def _ranges(i: int, tick: int, entry: Entry, team: Team, mission: Mission) -> Iterator[tuple[Row, bool]]:
+def _ranges(
+    i: int, tick: int, entry: Entry, team: Team, mission: Mission
+) -> Iterator[tuple[MeasuredRow, bool]]:
     """Yield each range in the entry of robot `i`, and whether it counts before that of the other robot."""
     noise, robot = mission.noise, team.robots[i]
     for to, rho in map(astuple, entry.anchors):
         if to < len(team.anchors):
             measured = MeasuredRange(rho + 0.0, noise.anchor_sigma)
-            yield Row(False, robot, team.anchors[to].id, tick, measured), True
+            yield MeasuredRow(False, robot, team.anchors[to].id, tick, measured), True
     for to, rho in map(astuple, entry.robots):
         if to < len(team.robots) and to != i:
             first, second = sorted((robot, team.robots[to]))
-            yield Row(True, first, second, tick, MeasuredRange(rho + 0.0, noise.mutual_sigma)), i < to
+            yield MeasuredRow(True, first, second, tick, MeasuredRange(rho + 0.0, noise.mutual_sigma)), i < to

@@ -103,11 +103,11 @@ class Near(NamedTuple):
         return Near(rho, place, tick) if rho < self.range else self._replace(latest=tick)
 
 
-class Known(NamedTuple):
-    """What a robot knows by a part of the measurements."""
+class TeamEstimate(NamedTuple):
+    """An estimate by a part of the measurements."""
 
     measured: TeamMeasurements = TeamMeasurements()
-    """What the estimate has read of the log."""
+    """The part of the log that the estimate has read."""
     following: Following = Following()
     """The estimate of all poses."""
     why_not: str = UNMET
@@ -129,11 +129,11 @@ class TeamState(msgspec.Struct, frozen=True):
     anchored: Near = Near()
     """The place where the robot was nearest to an anchor."""
     measured: TeamMeasurements = TeamMeasurements()
-    """What the estimate has read of the log."""
+    """The part of the log that the estimate has read."""
     following: Following = Following()
     """The estimate of all poses; in a team that tolerates false data, by the own measurements alone."""
-    pairs: tuple[Known, ...] = ()
-    """In such a team, the estimate by these and the measurements of each other robot."""
+    pairs: tuple[TeamEstimate, ...] = ()
+    """The estimates by these and the measurements of each other robot, in such a team."""
     wanted: tuple[str, ...] = ()
     """The anchors that are not accurate enough yet, the least accurate one first."""
     why_not: str = "it has not moved yet"
@@ -182,7 +182,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         """Return the state of a robot that has measured nothing yet."""
         assert config.team is not None
         log = TeamLog.of(config.team, hearsay=not config.tolerates)
-        pairs = (Known(),) * len(config.team.robots) if config.tolerates else ()
+        pairs = (TeamEstimate(),) * len(config.team.robots) if config.tolerates else ()
         return TeamState(config, log, pairs=pairs, nearest=(Near(),) * len(config.team.robots))
 
     def observe(self, state: TeamState, observation: Observation) -> TeamState:
@@ -280,7 +280,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
 def _followed(state: TeamState) -> TeamState:
     """Return `state` with the estimate by all measurements so far."""
     own, log = state.own, state.log.only((state.own,)) if state.config.tolerates else state.log
-    known = _estimated(state, Known(state.measured, state.following), log)
+    known = _estimated(state, TeamEstimate(state.measured, state.following), log)
     wanted, why_not = _wanted(known.following, state.team, state.config.mission.confidence), known.why_not
     if wanted and not why_not:
         why_not = f"anchor {wanted[0]} is not known to {state.team.survey:g} m yet"
@@ -294,7 +294,7 @@ def _followed(state: TeamState) -> TeamState:
     return replace(state, measured=measured, following=following, why_not=why_not, wanted=wanted, pairs=pairs)
 
 
-def _estimated(state: TeamState, before: Known, log: TeamLog) -> Known:
+def _estimated(state: TeamState, before: TeamEstimate, log: TeamLog) -> TeamEstimate:
     """Return the estimate by `log` that goes on from the one `before`."""
     mission, robot = state.config.mission, state.config.robot
     measured = before.measured.grown(log, state.team, mission)
@@ -303,7 +303,7 @@ def _estimated(state: TeamState, before: Known, log: TeamLog) -> Known:
     why_not = following.reasons.get(robot)
     if why_not is None:
         why_not = undetermined(used.robots.index(robot), following.known.located, used)
-    return Known(measured, following, why_not)
+    return TeamEstimate(measured, following, why_not)
 
 
 def _wanted(following: Following, team: Team, confidence: float) -> tuple[str, ...]:

@@ -13,8 +13,8 @@ from compose.extras import need
 from compose.launch.signals import StoppedBySignal
 from compose.scenario.scenario_file import setting
 from compose.sweep.hunt.coverage import never
+from compose.sweep.hunt.exploration import FoundBreach, Hunt
 from compose.sweep.hunt.mutation import fault_lines
-from compose.sweep.hunt.search import Found, Hunt
 from compose.terminal.invocation import program
 from compose.terminal.text_width import tell
 from protocol.output import one_line
@@ -68,7 +68,7 @@ def _say_reached(hunt: Hunt, scenario: str, seconds: float) -> None:
             tell(f"never reached, {kind}: {', '.join(names)}")
 
 
-def _write(found: Found, out: Path, command: str) -> None:
+def _write(found: FoundBreach, out: Path, command: str) -> None:
     import tomli_w  # noqa: PLC0415  # the library is optional
 
     lines = [

@@ -51,7 +51,7 @@ VIRTUAL_TIMEOUT_S = 30.0
 """The time in s of the virtual clock that the processes wait for each other."""
 
 
-class Ended(NamedTuple):
+class VirtualEnd(NamedTuple):
     """The end of a mission."""
 
     kills: int
@@ -65,7 +65,7 @@ class _Killed(BaseException):
 
 
 class _Sample(NamedTuple):
-    """What a subscriber of Zenoh receives, as far as Tandem reads it."""
+    """A sample that a subscriber of Zenoh receives, as far as Tandem reads it."""
 
     key_expr: str
     payload: zenoh.ZBytes
@@ -73,7 +73,7 @@ class _Sample(NamedTuple):
     attachment: zenoh.ZBytes | None = None
 
 
-def run_mission(scenario: Scenario, folder: Path, kills: Sequence[Kill] = ()) -> Ended:
+def run_mission(scenario: Scenario, folder: Path, kills: Sequence[Kill] = ()) -> VirtualEnd:
     """Run `scenario`, write its journals to `folder`, and return how it ended. Killed processes restart."""
     return _Network(scenario, folder, kills).run()
 
@@ -177,7 +177,7 @@ class _Network:
         """Call `act` when the clock reaches `due`, after everything that was due by then before this call."""
         heapq.heappush(self._due, (due, next(self._number), act))
 
-    def run(self) -> Ended:
+    def run(self) -> VirtualEnd:
         """Run all processes until they have ended, or one has failed."""
         processes = [_Process(self, name) for name in (WORLD, *[one.id for one in self.scenario.robots])]
         for one in processes:
@@ -194,7 +194,7 @@ class _Network:
         self.over = True
         for one in processes:
             one.wake()
-        return Ended(self.taken, tuple(self.failures))
+        return VirtualEnd(self.taken, tuple(self.failures))
 
     def send(self, key: str, frame: bytes) -> None:
         """Deliver `frame` to all subscribers of `key`, after a time of LATENCIES_S."""

@@ -66,8 +66,8 @@ class MissionTable(Mission, frozen=True, forbid_unknown_fields=True):
     0: they do not wait for it.
     """
     diameter: Clearance = 0.0
-    """With `frame`, the largest distance in m of a start from that of the first robot, which searches for the
-    others.
+    """The largest distance in m of a start from that of the first robot, which searches for the others; with
+    `frame`.
 
     0: ranges connect all starts.
     """

@@ -462,7 +462,7 @@ def near_anchors(
     )
 
 
-class Row(NamedTuple):
+class MeasuredRow(NamedTuple):
     """A range with the names of its radios, in the order of the ranges of a fit."""
 
     mutual: bool
@@ -487,7 +487,7 @@ def joint_measurements(
         if isinstance(value, Manoeuvre) and key.tick == len(steps[key.robot]):
             steps[key.robot].append(value)
     rows = [
-        Row(key.kind == "mutual range", key.robot, key.other, key.tick, value)
+        MeasuredRow(key.kind == "mutual range", key.robot, key.other, key.tick, value)
         for key, value in facts.ordered
         if isinstance(value, MeasuredRange)
     ]
@@ -498,7 +498,7 @@ def of_rows(
     places: Mapping[str, AnchorPlace],
     starts: Mapping[str, StartPose],
     steps: Mapping[str, Sequence[Manoeuvre]],
-    measured: Iterable[Row],
+    measured: Iterable[MeasuredRow],
     noise: Noise,
     period: float,
     reach: float,

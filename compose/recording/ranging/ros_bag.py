@@ -57,11 +57,11 @@ class TopicTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robot: str = ""
     """The robot whose poses these are, or that ranged."""
     robot_field: str = ""
-    """In place of `robot`: the field with its name or number."""
+    """The field with its name or number, in place of `robot`."""
     to: str = ""
     """The anchor or robot to which the ranges are."""
     to_field: str = ""
-    """In place of `to`: the field with its name or number."""
+    """The field with its name or number, in place of `to`."""
     distance: str = ""
     """The field with the distance, of messages that are no sensor_msgs/Range."""
     scale: Scale = 1.0

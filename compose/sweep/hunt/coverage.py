@@ -1,4 +1,4 @@
-"""What a run has reached: tasks and transitions, the conditions that prevented a claim, and messages."""
+"""The states that a run has reached: tasks and transitions, conditions that prevented a claim, messages."""
 
 from __future__ import annotations
 

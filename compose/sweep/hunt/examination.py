@@ -15,7 +15,7 @@ from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
 from compose.sweep.hunt.coverage import WatchedPlanner, reached
 from compose.sweep.hunt.invariants import Breach, breaches
-from compose.sweep.hunt.mutation import Known
+from compose.sweep.hunt.mutation import Clues
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.wire import EncodedMessages
 from world.scenario import Scenario
@@ -29,9 +29,9 @@ class Examined(msgspec.Struct, frozen=True):
 
     breaches: tuple[Breach, ...] = ()
     reached: frozenset[str] = frozenset()
-    known: Known = Known(())
+    known: Clues = Clues(())
     refused: str | None = None
-    """Why the input was not run; None if it was."""
+    """The reason why the input was not run; None if it was."""
 
 
 def scenario_of(table: dict[str, Any]) -> tuple[Scenario, tuple[Kill, ...]]:
@@ -62,7 +62,7 @@ def examined(table: dict[str, Any]) -> Examined:
     every = [*again, *breaches(run, replayed=not again)]
     ids = tuple([one.id for one in scenario.robots])
     found |= seen | {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
-    return Examined(tuple(every), frozenset(found), Known(ids, run.length - 1, moments))
+    return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments))
 
 
 def _task(run: Run, kill: Kill) -> str:

@@ -27,7 +27,7 @@ class Breach(msgspec.Struct, frozen=True):
     kind: str
     """The invariant."""
     what: str
-    """What was found, and where."""
+    """The finding, and its place."""
 
 
 def breaches(run: Run, *, replayed: bool) -> Iterator[Breach]:
@@ -97,7 +97,7 @@ def late(run: Run) -> Iterator[Breach]:
 
 
 def truth_lost(run: Run) -> Iterator[Breach]:
-    """With exact sensors and honest peers, the true pose is one of those that a robot considers possible."""
+    """The true pose is one of those that a robot considers possible, with exact sensors and honest peers."""
     scenario = run.scenario
     if not scenario.mission.noise.exact or any(one.attack is not None for one in scenario.robots):
         return
@@ -111,7 +111,7 @@ def truth_lost(run: Run) -> Iterator[Breach]:
 
 
 def forgotten(run: Run) -> Iterator[Breach]:
-    """In a pair, no acknowledgement goes back, and nothing is sent from an earlier tick than before."""
+    """No acknowledgement of a pair goes back, and nothing is sent from an earlier tick than before."""
     for robot, agent in run.agents.items() if run.scenario.in_pairs else ():
         before = (0, 0, 0, 0)
         for step in agent.steps:

@@ -34,8 +34,8 @@ CELLS_OF_SWEEP = 6
 """The number of cells of each shipped sweep, evenly spread, from which the corpus begins."""
 
 
-class Known(msgspec.Struct, frozen=True):
-    """What an earlier run tells about where to change its input."""
+class Clues(msgspec.Struct, frozen=True):
+    """The places of an earlier run at which to change its input."""
 
     robots: tuple[str, ...]
     ticks: int = 50
@@ -69,7 +69,7 @@ def is_noisy(table: Mapping[str, Any]) -> bool:
     return bool(table["mission"].get("noise"))
 
 
-def mutated(table: Mapping[str, Any], known: Known, other: Mapping[str, Any], draw: random.Random) -> Table:
+def mutated(table: Mapping[str, Any], known: Clues, other: Mapping[str, Any], draw: random.Random) -> Table:
     """Return `table` with one to three changes; `other` is an input of which parts may be taken."""
     found = copy.deepcopy(dict(table))
     for _ in range(draw.choice((1, 1, 2, 3))):
@@ -82,11 +82,11 @@ def mutated(table: Mapping[str, Any], known: Known, other: Mapping[str, Any], dr
     return found
 
 
-def _seed(table: Table, _known: Known, draw: random.Random) -> Table:
+def _seed(table: Table, _known: Clues, draw: random.Random) -> Table:
     return {**table, "seed": draw.getrandbits(31)}
 
 
-def _start(table: Table, _known: Known, draw: random.Random) -> Table | None:
+def _start(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     """Draw the start of a robot, special places and headings included."""
     robots = table.get("robot", [])
     if not robots or any("anchor" not in one for one in robots):
@@ -100,7 +100,7 @@ def _start(table: Table, _known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-def _fault(table: Table, known: Known, draw: random.Random) -> Table | None:
+def _fault(table: Table, known: Clues, draw: random.Random) -> Table | None:
     """Add a fault of the radio, mostly of a few ticks."""
     if len(table.get("fault", [])) >= MOST_FAULTS:
         return None
@@ -127,7 +127,7 @@ def _fault(table: Table, known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-def _kill(table: Table, known: Known, draw: random.Random) -> Table | None:
+def _kill(table: Table, known: Clues, draw: random.Random) -> Table | None:
     """Add kills of processes. Sensors that are exact allow many: what a killed process replays is short."""
     most = MOST_FAULTS if is_noisy(table) else MOST_KILLS
     for _ in range(min(most - len(table.get("kill", [])), draw.choice((1, 2, 5, most)))):
@@ -139,7 +139,7 @@ def _kill(table: Table, known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-def _attack(table: Table, _known: Known, draw: random.Random) -> Table | None:
+def _attack(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     """Let a robot report false data."""
     kind = draw.choice(get_args(attack.Kind))
     part = "all" if kind in attack.OF_THE_START else draw.choice(get_args(attack.Part))
@@ -154,7 +154,7 @@ def _attack(table: Table, _known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-def _death(table: Table, known: Known, draw: random.Random) -> Table | None:
+def _death(table: Table, known: Clues, draw: random.Random) -> Table | None:
     """Let a robot of a group die."""
     if "group" in table:
         table["group"]["dies"] = known.tick(draw)
@@ -165,7 +165,7 @@ def _death(table: Table, known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-def _noise(table: Table, _known: Known, draw: random.Random) -> Table:
+def _noise(table: Table, _known: Clues, draw: random.Random) -> Table:
     """Give all sensors other noise, which the robots are told."""
     sigma = draw.choice(RANGE_SIGMAS)
     noise: Table = {"anchor_sigma": sigma, "mutual_sigma": sigma}
@@ -177,11 +177,11 @@ def _noise(table: Table, _known: Known, draw: random.Random) -> Table:
     return table
 
 
-def _planner(table: Table, _known: Known, draw: random.Random) -> Table:
+def _planner(table: Table, _known: Clues, draw: random.Random) -> Table:
     return {**table, "planner": {"name": draw.choice(PLANNER_NAMES)}}
 
 
-def _names(table: Table, _known: Known, draw: random.Random) -> Table | None:
+def _names(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     """Give the robots other names."""
     robots = table.get("robot", [])
     if len(robots) < 2:
@@ -198,7 +198,7 @@ def _names(table: Table, _known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-def _geometry(table: Table, _known: Known, draw: random.Random) -> Table:
+def _geometry(table: Table, _known: Clues, draw: random.Random) -> Table:
     """Change one length, speed or time of the mission, or where the anchors are."""
     mission, factor = table["mission"], draw.choice((0.3, 0.7, 0.9, 1.1, 1.5, 3.0))
     anchored = [one for one in table.get("robot", []) if "anchor" in one]
@@ -217,7 +217,7 @@ def _geometry(table: Table, _known: Known, draw: random.Random) -> Table:
     return table
 
 
-def _size(table: Table, _known: Known, draw: random.Random) -> Table | None:
+def _size(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     """Change the number of robots of a group, of those without an anchor, or of those that may be false."""
     if "group" not in table:
         return None
@@ -232,13 +232,13 @@ def _size(table: Table, _known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-def _less(table: Table, _known: Known, draw: random.Random) -> Table | None:
+def _less(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     """Leave something out."""
     shorter = list(simpler(table))
     return draw.choice(shorter) if shorter else None
 
 
-def _retimed(table: Table, known: Known, draw: random.Random) -> Table | None:
+def _retimed(table: Table, known: Clues, draw: random.Random) -> Table | None:
     """Move a fault or a kill to another tick."""
     listed = [*table.get("fault", []), *table.get("kill", [])]
     if not listed:
@@ -251,7 +251,7 @@ def _retimed(table: Table, known: Known, draw: random.Random) -> Table | None:
     return table
 
 
-MUTATIONS: Mapping[Callable[[Table, Known, random.Random], Table | None], float] = {
+MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float] = {
     _seed: 2.0,
     _start: 2.0,
     _fault: 3.0,

@@ -16,7 +16,7 @@ from compose.launch.supervisor import ChildFailed
 from compose.sweep.hunt import coverage
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
-from compose.sweep.hunt.mutation import Known, Table, is_noisy, mutated, seeds, simpler
+from compose.sweep.hunt.mutation import Clues, Table, is_noisy, mutated, seeds, simpler
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
@@ -35,15 +35,15 @@ NOISY_SLOWER = 20.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks."""
 
 
-class Entry(NamedTuple):
+class CorpusEntry(NamedTuple):
     """An input of the corpus."""
 
     table: Table
-    known: Known
+    known: Clues
 
     @property
     def share(self) -> float:
-        """How often it is changed, relative to others: as often as its run is short."""
+        """The frequency of its changes, relative to others: it is larger if its run is shorter."""
         return (
             1.0
             / (1 + self.known.ticks)
@@ -52,7 +52,7 @@ class Entry(NamedTuple):
         )
 
 
-class Found(NamedTuple):
+class FoundBreach(NamedTuple):
     """An input that breaks an invariant."""
 
     table: Table
@@ -69,14 +69,14 @@ class Hunt:
         self.seeds = seeds(source)
         """The inputs with which the hunt begins, the source first."""
         self._seed, self._jobs, self._guided = seed, jobs, guided
-        self.corpus: list[Entry] = []
+        self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
         self.seen: set[str] = set()
-        """What the runs have reached."""
+        """The states that the runs have reached."""
         self.runs = self.processes = self.refused = 0
         """The numbers of inputs, of those that also ran as processes, and of those that are no mission."""
 
-    def run(self, is_over: Callable[[Hunt], bool]) -> Found | None:
+    def run(self, is_over: Callable[[Hunt], bool]) -> FoundBreach | None:
         """Search until `is_over`, and return the first input that breaks an invariant, shrunk.
 
         `is_over` is asked after each batch.
@@ -104,7 +104,7 @@ class Hunt:
         """Return a mutation of an input of the corpus, or without the guide of one of the first inputs."""
         if not self._guided or not self.corpus:
             one = draw.choice(self.seeds)
-            known = Known(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
+            known = Clues(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
             return mutated(one, known, draw.choice(self.seeds), draw)
         latest = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
         [entry] = draw.choices(latest, [one.share for one in latest])
@@ -114,9 +114,9 @@ class Hunt:
         new = result.reached - self.seen
         self.seen |= new
         if new:
-            self.corpus.append(Entry(table, result.known))
+            self.corpus.append(CorpusEntry(table, result.known))
 
-    def _as_processes(self, inputs: Sequence[Table]) -> Found | None:
+    def _as_processes(self, inputs: Sequence[Table]) -> FoundBreach | None:
         """Run the first of `inputs` that has kills as processes, if it is time for that."""
         due = self.runs // PROCESSES_EACH > (self.runs - len(inputs)) // PROCESSES_EACH
         for table in [one for one in inputs if one.get("kill")] if due else ():
@@ -128,10 +128,10 @@ class Hunt:
             except UserError:
                 continue
             except ChildFailed as error:
-                return Found(table, Breach("a process dies", str(error)), self.runs)
+                return FoundBreach(table, Breach("a process dies", str(error)), self.runs)
             if differing:
                 what = f"as processes: {', '.join(differing)}"
-                return Found(table, Breach("the recording differs", what), self.runs)
+                return FoundBreach(table, Breach("the recording differs", what), self.runs)
             break
         return None
 
@@ -139,7 +139,7 @@ class Hunt:
 Examine = Callable[[Sequence[Table]], Iterator[Examined]]
 
 
-def _shrunk(table: Table, breach: Breach, runs: int, jobs: int, examine: Examine) -> Found:
+def _shrunk(table: Table, breach: Breach, runs: int, jobs: int, examine: Examine) -> FoundBreach:
     """Return the smallest input that breaks the same invariant, as far as MOST_TRIES runs show it."""
     left, tries = list(simpler(table)), 0
     while left and tries < MOST_TRIES:
@@ -151,7 +151,7 @@ def _shrunk(table: Table, breach: Breach, runs: int, jobs: int, examine: Examine
             if same is not None:
                 table, breach, left = smaller, same, list(simpler(smaller))
                 break
-    return Found(table, breach, runs)
+    return FoundBreach(table, breach, runs)
 
 
 @contextmanager
