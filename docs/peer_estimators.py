@@ -64,7 +64,7 @@ class Driven(NamedTuple):
 
 
 class Problem(NamedTuple):
-    """What was measured in one window."""
+    """The measurements of one window."""
 
     measured: JointMeasurements
     end: int
@@ -389,7 +389,7 @@ def scipy_starts(problem: Problem, draws: Generator, *, starts: int = SCIPY_STAR
 
 
 class Filter:
-    """What both filters have in common: states of all robots and biases, and ranges in the order of time."""
+    """The common part of both filters: states of all robots and biases, and ranges in the order of time."""
 
     def __init__(self, problem: Problem) -> None:
         self.problem, self.driven = problem, problem.driven()

@@ -33,7 +33,7 @@ HEADLINE = (
 
 
 class Trial(NamedTuple):
-    """What an estimator made of a window."""
+    """The result of an estimator in a window."""
 
     recording: str
     ranges: str

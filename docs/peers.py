@@ -70,7 +70,7 @@ class Window(NamedTuple):
     recording: str
     """The name of the recording, as in the tables."""
     ranges: str
-    """What was done to its ranges."""
+    """The change that was made to its ranges."""
     source: Path
     robots: tuple[str, ...]
     begin_s: float
@@ -86,7 +86,7 @@ class Window(NamedTuple):
 
 
 PROFILES = {"as recorded": "uwb-calibrated", "+0.35 m": "uwb", "raw radios": "uwb"}
-"""What is done to the ranges of TIERS, and the profile that is assumed."""
+"""The changes of the ranges of TIERS, each with the profile that is assumed."""
 
 
 def tiers_windows(source: Path, step_s: float = WINDOW_S) -> Iterator[Window]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from typing import NamedTuple
 
 from msgspec.structs import astuple, replace
@@ -25,18 +25,27 @@ class TeamMeasurements(NamedTuple):
     rows: Mapping[tuple[bool, str, str, int], MeasuredRow] = {}
     """The ranges. Both robots measure the same one between them: that of the first in the team counts."""
 
-    def grown(self, log: TeamLog, team: Team, mission: Mission) -> TeamMeasurements:
-        """Return this with the entries in `log` that are new."""
+    def grown(
+        self, log: TeamLog, team: Team, mission: Mission, of: Collection[int] | None = None
+    ) -> TeamMeasurements:
+        """Return this with the entries in `log` that are new.
+
+        They are those of the robots at the places `of`, which are the same each time, with their ranges to
+        anchors and to each other; None: all.
+        """
         steps, rows = dict(self.steps), dict(self.rows)
+        of = range(len(team.robots)) if of is None else of
         if team.origin is not None:
             steps.setdefault(team.origin, ())
         for i, since in enumerate(self.read or (0,) * len(log.logs)):
+            if i not in of:
+                continue
             robot = team.robots[i]
             driven: list[Manoeuvre] = []
             for tick, entry in enumerate(log.logs[i][since:], since):
                 if entry.executed is not None and tick == len(steps.get(robot, ())) + len(driven) + 1:
                     driven.append(Manoeuvre(entry.executed.v + 0.0, entry.executed.omega + 0.0))
-                for row, first in _ranges(i, tick, entry, team, mission):
+                for row, first in _ranges(i, tick, entry, team, mission, of):
                     if first or row[:4] not in rows:
                         rows[row[:4]] = row
                     for name in (row.first, row.second)[: 1 + row.mutual]:
@@ -65,7 +74,7 @@ class TeamMeasurements(NamedTuple):
 
 
 def _ranges(
-    i: int, tick: int, entry: Entry, team: Team, mission: Mission
+    i: int, tick: int, entry: Entry, team: Team, mission: Mission, of: Collection[int]
 ) -> Iterator[tuple[MeasuredRow, bool]]:
     """Yield each range in the entry of robot `i`, and whether it counts before that of the other robot."""
     noise, robot = mission.noise, team.robots[i]
@@ -74,6 +83,6 @@ def _ranges(
             measured = MeasuredRange(rho + 0.0, noise.anchor_sigma)
             yield MeasuredRow(False, robot, team.anchors[to].id, tick, measured), True
     for to, rho in map(astuple, entry.robots):
-        if to < len(team.robots) and to != i:
+        if to in of and to != i:
             first, second = sorted((robot, team.robots[to]))
             yield MeasuredRow(True, first, second, tick, MeasuredRange(rho + 0.0, noise.mutual_sigma)), i < to

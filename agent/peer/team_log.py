@@ -9,7 +9,7 @@ If some robots may report false data, a report counts for its sender alone, and 
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from typing import Annotated
 
 import msgspec
@@ -91,20 +91,6 @@ class TeamLog(msgspec.Struct, frozen=True):
         """Return the logs of a team that has measured nothing yet."""
         count = len(team.robots)
         return TeamLog(((),) * count, ((0,) * count,) * count, hearsay=hearsay)
-
-    def only(self, robots: Collection[int]) -> TeamLog:
-        """Return the logs of these robots, with their ranges to anchors and to each other."""
-        return replace(self, logs=tuple([self._among(robots, k) for k in range(len(self.logs))]))
-
-    def _among(self, robots: Collection[int], robot: int) -> tuple[Entry, ...]:
-        if robot not in robots:
-            return ()
-        return tuple(
-            [
-                replace(entry, robots=tuple([one for one in entry.robots if one.to in robots]))
-                for entry in self.logs[robot]
-            ]
-        )
 
     def measured(self, own: int, observation: Observation, team: Team) -> TeamLog:
         """Return the logs with an observation of the robot at the place `own`."""

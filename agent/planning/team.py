@@ -8,7 +8,7 @@ can claim its pose. No plan is made beforehand: what anchors there are is data.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -279,14 +279,15 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
 
 def _followed(state: TeamState) -> TeamState:
     """Return `state` with the estimate by all measurements so far."""
-    own, log = state.own, state.log.only((state.own,)) if state.config.tolerates else state.log
-    known = _estimated(state, TeamEstimate(state.measured, state.following), log)
+    own = state.own
+    before = TeamEstimate(state.measured, state.following)
+    known = _estimated(state, before, (own,) if state.config.tolerates else None)
     wanted, why_not = _wanted(known.following, state.team, state.config.mission.confidence), known.why_not
     if wanted and not why_not:
         why_not = f"anchor {wanted[0]} is not known to {state.team.survey:g} m yet"
     pairs = tuple(
         [
-            _estimated(state, pair, state.log.only((own, k))) if k != own and state.log.logs[k] else pair
+            _estimated(state, pair, (own, k)) if k != own and state.log.logs[k] else pair
             for k, pair in enumerate(state.pairs)
         ]
     )
@@ -294,10 +295,10 @@ def _followed(state: TeamState) -> TeamState:
     return replace(state, measured=measured, following=following, why_not=why_not, wanted=wanted, pairs=pairs)
 
 
-def _estimated(state: TeamState, before: TeamEstimate, log: TeamLog) -> TeamEstimate:
-    """Return the estimate by `log` that goes on from the one `before`."""
+def _estimated(state: TeamState, before: TeamEstimate, of: Collection[int] | None) -> TeamEstimate:
+    """Return the estimate that goes on from the one `before`, by the measurements `of` robots; None: all."""
     mission, robot = state.config.mission, state.config.robot
-    measured = before.measured.grown(log, state.team, mission)
+    measured = before.measured.grown(state.log, state.team, mission, of)
     used, rule = measured.joint(state.team, mission), ClaimRule(mission.accuracy, mission.confidence)
     following = before.following.after(used, rule, "team", (robot,))
     why_not = following.reasons.get(robot)

@@ -143,11 +143,11 @@ class PoseRow(Row, frozen=True):
     qx: Part | None = None
     """The orientation as a quaternion in place of `heading`, z up: its x."""
     qy: Part | None = None
-    """Its y."""
+    """The y of the quaternion."""
     qz: Part | None = None
-    """Its z."""
+    """The z of the quaternion."""
     qw: Part | None = None
-    """Its w."""
+    """The w of the quaternion."""
 
 
 class TruePoseRow(PoseRow, frozen=True):

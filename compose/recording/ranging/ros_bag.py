@@ -96,7 +96,7 @@ class _Message(NamedTuple):
 
     content: Any
     kind: str
-    """Its type, such as `nav_msgs/msg/Odometry`."""
+    """The type of its messages, such as `nav_msgs/msg/Odometry`."""
     t: float
     """The time in s."""
     place: SourcePlace

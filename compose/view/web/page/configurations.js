@@ -1,9 +1,9 @@
 // The configurations of a pair: each in its tint, joined by a line, with the distance that it predicts as a circle
 // around the robot that drives, and the manoeuvres between which that robot has chosen.
 
-import { between, compose, distance, step, TAU } from "./geometry.js";
+import { between, compose, distance, step } from "./geometry.js";
 import { held_now } from "./held.js";
-import { DASHES } from "./pen.js";
+import { circle, DASHES } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 
 const MOST = 12; // configurations that are drawn
@@ -78,7 +78,8 @@ export class Configurations {
       const mover = this.#mover(store, ruling ? tick - 1 : tick, robot), of_a = mover === robot.id;
       if (ruling && truth && places.get(mover)) {
         this.plane.marks.add("measured");
-        this.#circle(places.get(mover), measured, look.ink, 0.2, [], 9);
+        pen.globalAlpha = 0.2;
+        circle(this.plane, places.get(mover), measured, look.ink, 9);
       }
       live.forEach((one, i) => {
         const centre = truth ? places.get(mover) : of_a ? one.a : one.b, still = of_a ? one.b : one.a;
@@ -88,7 +89,8 @@ export class Configurations {
         // Numbers are on the far side of the circles: near the other robot are its name and its poses.
         const away = Math.atan2(opposite[1] - centre[1], centre[0] - opposite[0]);
         const colour = look.tint(one.tint), angle = away + (i - (live.length - 1) / 2) * NEXT_NUMBER;
-        this.#circle(centre, one.predicted, colour, one.out ? 0.2 : 0.9, DASHES[one.tint] ?? DASHES[0]);
+        pen.globalAlpha = one.out ? 0.2 : 0.9;
+        circle(this.plane, centre, one.predicted, colour, 1.6, DASHES[one.tint] ?? DASHES[0]);
         const [x, y] = this.plane.at(centre), radius = one.predicted * this.plane.scale;
         if (one.out) return;
         pen.globalAlpha = 1;
@@ -101,18 +103,6 @@ export class Configurations {
   /** Returns the robot that makes the last manoeuvre; b if both drive. */
   #mover(store, tick, robot) {
     return joined(store.scene(tick), robot.id)?.manoeuvre?.robot ?? robot.peer;
-  }
-
-  #circle(centre, radius, colour, alpha, dash, width = 1.6) {
-    const pen = this.plane.context;
-    pen.globalAlpha = alpha;
-    pen.strokeStyle = colour;
-    pen.lineWidth = width;
-    pen.setLineDash(dash);
-    pen.beginPath();
-    pen.arc(...this.plane.at(centre), radius * this.plane.scale, 0, TAU);
-    pen.stroke();
-    pen.setLineDash([]);
   }
 
   /** Draws an arrow along poses of a robot that drives with the speed `v`; `halo` is the width of its ground. */

@@ -1,6 +1,7 @@
 // Why exact distances leave several hypotheses: the mirror images of phase 1, and the crossings of an encounter.
 
 import { compose, distance, frame_of, step, TAU, wrap } from "./geometry.js";
+import { circle } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 import { metres } from "./words.js";
 
@@ -63,7 +64,7 @@ export class Construction {
     if (!found) return;
     const [x, y] = robot.anchor, largest = Math.max(...found.ranges.map(([, range]) => range));
     for (const [k, range] of found.ranges) {
-      this.#circle(robot.anchor, range, look.range, 1.2);
+      circle(this.plane, robot.anchor, range, look.range, 1.2);
       if (k !== tick) this.plane.labels.put(metres(range), ...this.plane.at([x, y - range]), look.range, "center");
     }
     const start = found.ways[0].find((pose, i) => distance(pose, found.ways[1][i]) < 1e-6);
@@ -85,11 +86,11 @@ export class Construction {
     if (!found) return () => true;
     const angle = turned * TAU, about = ([x, y]) => compose([...found.anchor, angle], [x - found.anchor[0], y - found.anchor[1], 0]);
     this.plane.marks.add("crossing");
-    this.#circle(...found.circle, look.ghost, 2, [2, 6]);
-    for (const place of found.places) this.#circle(found.anchor, distance(place, found.anchor), look.ghost, 1, [3, 4]);
+    circle(this.plane, ...found.circle, look.ghost, 2, [2, 6]);
+    for (const place of found.places) circle(this.plane, found.anchor, distance(place, found.anchor), look.ghost, 1, [3, 4]);
     if (turned < 1) {
       const path = found.path.map(about), met = found.turns.some((turn) => Math.abs(wrap(turn - angle)) < PASSING);
-      found.distances.forEach((range, i) => this.#circle(path[i], range, met ? look.ink : look.link, met ? 2 : 1.2));
+      found.distances.forEach((range, i) => circle(this.plane, path[i], range, met ? look.ink : look.link, met ? 2 : 1.2));
       this.#line([found.anchor, ...path].map((one) => this.plane.at(one)), look.ink, 1.6, []);
       pen.fillStyle = look.ink;
       for (const place of found.places.map(about)) {
@@ -100,17 +101,6 @@ export class Construction {
     }
     pen.globalAlpha = 1;
     return (i) => turned >= 1 || found.turns[i] <= turned * TAU;
-  }
-
-  #circle(centre, radius, colour, width, dash = []) {
-    const pen = this.plane.context;
-    pen.strokeStyle = colour;
-    pen.lineWidth = width;
-    pen.setLineDash(dash);
-    pen.beginPath();
-    pen.arc(...this.plane.at(centre), radius * this.plane.scale, 0, TAU);
-    pen.stroke();
-    pen.setLineDash([]);
   }
 
   #line(points, colour, width, dash) {

@@ -298,7 +298,8 @@ function draw() {
     view.eliminated = guide.eliminated(view);
     view.planned = guide.planned(view);
     view.told = guide.told(view);
-    view.turned = guide.turned(view) === null ? null : still.matches ? 1 : guide.turned(view);
+    const turned = guide.turned(view);
+    view.turned = turned !== null && still.matches ? 1 : turned;
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
     controls();
     $("caption").classList.toggle("several", guide.several(view));

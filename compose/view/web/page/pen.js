@@ -26,6 +26,18 @@ export const fading = (share, moving) => (moving ? Math.max(0, 1 - 1.6 * share) 
 /** The dashes of the circle that a configuration predicts, by its number from 0, so that circles differ without colour. */
 export const DASHES = [[6, 4], [12, 4], [2, 4], [10, 3, 2, 3]];
 
+/** Draws a circle about a place of the plane; `radius` is in m, `width` and `dash` are in pixels. */
+export function circle(plane, centre, radius, colour, width, dash = []) {
+  const pen = plane.context;
+  pen.strokeStyle = colour;
+  pen.lineWidth = width;
+  pen.setLineDash(dash);
+  pen.beginPath();
+  pen.arc(...plane.at(centre), radius * plane.scale, 0, TAU);
+  pen.stroke();
+  pen.setLineDash([]);
+}
+
 /** Draws a cross over a robot. */
 export function cross(pen, x, y, size, look) {
   const r = 0.7 * size;
