@@ -188,7 +188,42 @@ def test_a_large_plan_is_possible_and_near_its_lower_bound(robots: int) -> None:
 
 
 FACTOR = 1.0 + MOST_TRAVEL
-"""The proved factor of docs/groups.md for at most 490 robots."""
+"""The proved factor for at most 490 robots.
+
+Here, m is the time of a meeting, v = v_max, d(a, b) the distance of two anchors, s(a, b) the bound of a first
+meeting, and chord(x) = 2 sin(x / 2), and 2 from x = pi on.
+
+Lower bound. No plan localises a robot sooner than its quickest first meeting, or than one visit from the
+place of the quickest first meeting of another robot: several visits take no less time. L is the latest of
+these times of all robots. Up to 8 robots, the plan is optimal, and its bound is the lower bound.
+
+Assumption. Each first meeting takes at least one and a half meetings and twice the way: s(a, b) >= 1.5 m + 2
+d(a, b) / v. The orbits of `assured` satisfy it if a robot moves at least R / 25 in a tick.
+
+Construction (`sector_forest`). First meetings that end by L are chosen, the quickest first, each robot at
+most once. Each other robot w joins the cell of the chosen one with the smallest s(a, b) + C d(b, w) / v,
+where C = 5.97. Two localised robots at one place share the robots that are left there: sorted by their angle
+about b, these are cut into two parts. Each of the two visits the nearest to b of its part, and then both
+share the others of this part. The cut is the one for which the larger A(angle) r / v + m log2(number) of both
+parts is smallest, with r the largest distance from b in the cell and A(x) = chord(x) + chord(x / 2) + chord(x
+/ 4) + x / 4. The halved sectors are those of Bonichon et al., *Freeze-tag in L1 has wake-up time five with
+linear complexity* (DISC 2024); the cut differs, because meetings take time.
+
+A cell of k robots takes at most C r / v + m log2(k + 1) after its first meeting, with C = 1 + A(pi). A way
+from distance p to q >= p by an angle x is at most q - p + r chord(x) long, and the differences add up to at
+most r. The rest is at most A(x) r / v + m log2(k + 1) for two robots that share k of a sector of x, by
+induction on k: of the first cut whose first part has the larger value and the one before, the larger values
+are those of parts with one robot in common, so that their angles add up to at most x and their numbers to k +
+1. A and log2 are concave, so the smaller value is at most A(x / 2) r / v + m log2((k + 1) / 2); the visit
+before takes at most chord(x) r / v + m, and A(x) >= chord(x) + A(x / 2). At b itself, the first ways have no
+angle.
+
+The bound is at most (1 + C) L up to 490 robots. Let P = (a, b) be the first meeting by which L counts w. If
+it was chosen, d(b, w) / v <= L - m - s(P). Otherwise a robot of P is in a chosen Q with s(Q) <= s(P), and by
+the assumption the ways of both take at most s(P) - 1.5 m. So w is at most v (L - 1.5 m) from where Q ends,
+its cell ends by (1 + C) L - m (1.5 C - log2(k + 1)), and 2^(1.5 C) = 494. With more robots, m (log2(k + 1) -
+8.9) comes on top.
+"""
 SHAPES = (
     *(plans.square, plans.clusters, plans.line),
     *(plans.circle, plans.disc, plans.far_cluster, plans.fan, plans.spiral),
@@ -196,7 +231,7 @@ SHAPES = (
 
 
 class Group:
-    """A group whose first meetings take as little time as docs/groups.md assumes, some at one place."""
+    """A group whose first meetings take as little time as the proof of FACTOR assumes, some at one place."""
 
     def __init__(self, robots: int, meeting: float, seed: int, shape: plans.Shape | None = None) -> None:
         draw = random.Random(seed)

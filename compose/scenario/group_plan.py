@@ -35,7 +35,7 @@ class GroupPlan(msgspec.Struct, frozen=True):
     bound: float
     """The bound in s of the time at which all are localised."""
     least_bound: float
-    """A lower bound in s of the `bound` of any plan. docs/groups.md proves a factor of the two."""
+    """A lower bound in s of the `bound` of any plan; their proved factor: tests/test_wake_up_tree.py."""
     travel: MeetingTimes
     """The bounds of seed pairs, and of travel alone."""
 

@@ -1,4 +1,4 @@
-"""A wake-up forest whose last end is within a factor of a lower bound, as docs/groups.md proves.
+"""A wake-up forest whose last end is within a factor of a lower bound, as tests/test_wake_up_tree.py proves.
 
 Robots are localised from the inside out, and the two at one place share a sector, as in the strategy
 Split-Cone (Bonichon et al., Freeze-tag in L1 has wake-up time five, DISC 2024). Here, a cut balances the
