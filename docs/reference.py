@@ -8,6 +8,7 @@ nothing, and its exit status is 1 if a page would change.
 from __future__ import annotations
 
 import argparse
+import ast
 import inspect
 import re
 import subprocess
@@ -319,6 +320,18 @@ def _help(action: argparse.Action) -> str:
         return text
 
 
+def packages() -> str:
+    """Return the table of the packages: what each is, by its docstring, and the names of its modules."""
+    rows = []
+    for package in ("protocol", "agent", "world", "compose", "tandem"):
+        for path in sorted((DOCS.parent / package).rglob("__init__.py")):
+            text = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+            modules = sorted(one.stem for one in path.parent.glob("*.py") if not one.stem.startswith("__"))
+            names = ", ".join(f"`{one}`" for one in modules) or "-"
+            rows.append([f"`{path.parent.relative_to(DOCS.parent)}`", text.splitlines()[0], names])
+    return _table(["package", "content", "modules"], rows)
+
+
 def printed(scenario: str) -> str:
     """Return the output of `tandem run SCENARIO`."""
     command = [sys.executable, "-m", "tandem", "run", scenario, "--in-process"]
@@ -390,6 +403,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "wire-messages": wire_messages,
     "wire-parts": wire_parts,
     "command-line": command_line,
+    "packages": packages,
     "removed": lambda: _table(["removed", "instead"], [[f"`{one.name}`", one.instead] for one in REMOVED]),
     **{f"results-{name}": partial(results_of, name) for name in spec.shipped()},
 }
