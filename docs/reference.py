@@ -13,7 +13,7 @@ import inspect
 import re
 import subprocess
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any, get_args
@@ -23,6 +23,7 @@ from msgspec import NODEFAULT
 from msgspec import inspect as types
 
 from agent.estimation import claim, judged
+from compose.audit import rules
 from compose.cli.commands import COMMANDS
 from compose.cli.main import command_parser
 from compose.cli.removed import REMOVED
@@ -65,6 +66,8 @@ from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
 from tests.expected import tables as expected_tables
 from tests.expected.tables import table as results_of
+from world.radio_models import RADIO_MODELS
+from world.range_models import RANGE_MODELS
 from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
 
 DOCS = Path(__file__).parent
@@ -320,6 +323,26 @@ def _help(action: argparse.Action) -> str:
         return text
 
 
+def audit_rules() -> str:
+    """Return the table of the rules of the audit, in their order, by their docstrings."""
+    texts = [" ".join((rule.__doc__ or "").removeprefix("Check that ").split()) for rule in rules.AUDIT_RULES]
+    names = [f"`{rule.__name__}`" for rule in rules.AUDIT_RULES]
+    return _table(["rule", "condition"], zip(names, texts, strict=True))
+
+
+def models(shipped: Mapping[str, type]) -> str:
+    """Return the table of the shipped range or radio models: name, options with defaults, docstrings."""
+    rows = []
+    for name, cls in shipped.items():
+        options = []
+        for one in inspect.signature(cls).parameters.values():
+            value = "" if one.default is one.empty else f" = {msgspec.json.encode(one.default).decode()}"
+            options.append(f"`{one.name}`{value}")
+        texts = [cls.__doc__ or "", getattr(cls.__init__, "__doc__", "") or "" if options else ""]
+        rows.append([f"`{name}`", ", ".join(options) or "-", " ".join(" ".join(texts).split())])
+    return _table(["model", "options and defaults", "effect"], rows)
+
+
 def packages() -> str:
     """Return the table of the packages: what each is, by its docstring, and the names of its modules."""
     rows = []
@@ -403,6 +426,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "wire-messages": wire_messages,
     "wire-parts": wire_parts,
     "command-line": command_line,
+    "audit-rules": audit_rules,
+    "range-models": partial(models, RANGE_MODELS),
+    "radio-models": partial(models, RADIO_MODELS),
     "packages": packages,
     "removed": lambda: _table(["removed", "instead"], [[f"`{one.name}`", one.instead] for one in REMOVED]),
     **{f"results-{name}": partial(results_of, name) for name in spec.shipped()},

@@ -24,7 +24,7 @@ def observation(run: Run) -> Checks:
 
 
 def contact(run: Run) -> Checks:
-    """Check that Reports were sent only in contact, and that those received are listed."""
+    """Check that Reports were sent only in contact, and those received are listed."""
     for robot, agent in run.agents.items():
         for step in agent.steps:
             if step.reports and step.observation.tick < len(run.observations):

@@ -11,7 +11,7 @@ from world.world_journal import WorldHistory
 
 
 def order(run: Run) -> Checks:
-    """Check that each journal is complete and in order, and that journals agree on messages they share.
+    """Check that each journal is complete and in order, and journals agree on messages they share.
 
     A journal that ends early, or has a frame out of order, is one violation. Its earlier content is checked.
     """
