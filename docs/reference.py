@@ -23,6 +23,7 @@ from msgspec import NODEFAULT
 from msgspec import inspect as types
 
 from agent.estimation import claim, judged
+from agent.planning.planner import Planner
 from compose.audit import rules
 from compose.cli.commands import COMMANDS
 from compose.cli.main import command_parser
@@ -64,6 +65,7 @@ from protocol import messages, wire
 from protocol.attack import Attack
 from protocol.network import keys
 from protocol.noise import Noise, VelocityNoise
+from tandem.results import Run
 from tests.expected import tables as expected_tables
 from tests.expected.tables import table as results_of
 from world.radio_models import RADIO_MODELS
@@ -343,6 +345,32 @@ def models(shipped: Mapping[str, type]) -> str:
     return _table(["model", "options and defaults", "effect"], rows)
 
 
+def members_of(cls: type) -> str:
+    """Return the table of the public methods and attributes of `cls`, in their order, by their docstrings."""
+    (node,) = ast.parse(inspect.getsource(cls)).body
+    assert isinstance(node, ast.ClassDef)
+    rows = []
+    for one, after in zip(node.body, [*node.body[1:], ast.Pass()], strict=True):
+        match one, after:
+            case ast.FunctionDef(name=name), _:
+                words = [argument.arg for argument in one.args.args[1:]]
+                words += [f"*{one.args.vararg.arg}"] if one.args.vararg else []
+                words += [f"{argument.arg}=" for argument in one.args.kwonlyargs]
+                shown = (
+                    name
+                    if any("property" in ast.unparse(of) for of in one.decorator_list)
+                    else f"{name}({', '.join(words)})"
+                )
+                text = ast.get_docstring(one) or ""
+            case ast.AnnAssign(target=ast.Name(id=name)), ast.Expr(value=ast.Constant(value=str(text))):
+                shown = name
+            case _:
+                continue
+        if not name.startswith("_"):
+            rows.append([f"`{shown}`", " ".join(text.split())])
+    return _table(["name", "meaning"], rows)
+
+
 def packages() -> str:
     """Return the table of the packages: what each is, by its docstring, and the names of its modules."""
     rows = []
@@ -427,6 +455,8 @@ TABLES: dict[str, Callable[[], str]] = {
     "wire-parts": wire_parts,
     "command-line": command_line,
     "audit-rules": audit_rules,
+    "planner-methods": partial(members_of, Planner),
+    "run-members": partial(members_of, Run),
     "range-models": partial(models, RANGE_MODELS),
     "radio-models": partial(models, RADIO_MODELS),
     "packages": packages,
