@@ -238,7 +238,7 @@ class Beacon:
 
 def main() -> None:
     """Run the beacon: it answers a robot once all others are in its tick, have left it, or are parked."""
-    parser = argparse.ArgumentParser(description=main.__doc__)
+    parser = argparse.ArgumentParser(description=main.__doc__, allow_abbrev=False)
     parser.add_argument("--port", type=int, default=0)
     parser.add_argument("--reach", type=float, required=True, help="the sensing range R, in m")
     parser.add_argument("--lost", type=float, default=math.inf, help="s after which a silent robot is lost")

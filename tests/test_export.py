@@ -436,6 +436,8 @@ def test_a_missing_recording_and_an_unwritable_folder_are_refused(paper_1: Path,
     ended = tandem("export", tmp_path, "--tum")
     no = f"{tmp_path} contains no recording and no estimate: there is no world.journal and no estimate.csv"
     assert (ended.status, ended.err) == (2, f"tandem export: {no}\n")
+    (tmp_path / "estimate.csv").touch()
+    assert "`tandem export --tum` read the estimate in it" in tandem("export", tmp_path).err
     (tmp_path / "file").touch()
     ended = tandem("export", paper_1, "--out", tmp_path / "file")
     assert ended.status == 2

@@ -9,7 +9,7 @@ from compose.cli.export_files import EXPORT_MODULES, exported
 from compose.cli.recording import note, read_noted
 from compose.errors import ENDED, FAILED, UserError, writing
 from compose.extras import need
-from compose.recording.recording_files import WORLD_JOURNAL, journals_in, make_folder, user_errors
+from compose.recording import recording_files
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
@@ -39,7 +39,7 @@ def _pyfg(recording: Path, out: Path) -> None:
     from compose.recording.ranging.pyfg import written_pyfg  # noqa: PLC0415  # it needs numpy
     from compose.recording.ranging.run_ranges import ranges_of_run  # noqa: PLC0415
 
-    with user_errors(recording):
+    with recording_files.user_errors(recording):
         graph = written_pyfg(ranges_of_run(read_noted(recording, "export")))
     _write(out, "run.pyfg", graph.text)
     tell(", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
@@ -60,7 +60,7 @@ def _rerun(recording: Path, out: Path) -> None:
     from compose.view.export.rerun_recording import rerun_recording  # noqa: PLC0415  # slow, and optional
     from compose.view.recorded import checked, scenes_of  # noqa: PLC0415
 
-    with user_errors(recording):
+    with recording_files.user_errors(recording):
         run = read_noted(recording, "export")
         _, setup = checked(run)
         content = rerun_recording(setup, scenes_of(run))
@@ -69,13 +69,13 @@ def _rerun(recording: Path, out: Path) -> None:
 
 def _tum(recording: Path, out: Path) -> None:
     """Write the TUM files of a run, or of an estimate, to `out`, and print their paths."""
-    from compose.view.export.tum import ESTIMATE_CSV, tum_of_estimate, tum_of_run  # noqa: PLC0415  # numpy
+    from compose.view.export.tum import tum_of_estimate, tum_of_run  # noqa: PLC0415  # numpy
 
-    with user_errors(recording):
-        if (recording / ESTIMATE_CSV).exists() and not journals_in(recording):
+    with recording_files.user_errors(recording):
+        if (recording / recording_files.ESTIMATE_CSV).exists() and not recording_files.journals_in(recording):
             texts = tum_of_estimate(recording)
-        elif recording.is_dir() and not journals_in(recording):
-            neither = f"there is no {WORLD_JOURNAL} and no {ESTIMATE_CSV}"
+        elif recording.is_dir() and not recording_files.journals_in(recording):
+            neither = f"there is no {recording_files.WORLD_JOURNAL} and no {recording_files.ESTIMATE_CSV}"
             raise UserError(f"{recording} contains no recording and no estimate: {neither}")
         else:
             texts = tum_of_run(read_noted(recording, "export"))
@@ -85,7 +85,7 @@ def _tum(recording: Path, out: Path) -> None:
 
 def _write(out: Path, name: str, text: str | bytes) -> None:
     """Write a file to the folder `out`, and print its path. Raises UserError."""
-    make_folder(out)
+    recording_files.make_folder(out)
     with writing(out):
         files.write(out / name, text)
     say(str(out / name))

@@ -133,6 +133,7 @@ def command_parser(command: CommandEntry) -> CommandParser:
         prog=f"tandem {command.name}",
         description=command.summary,
         formatter_class=argparse.RawDescriptionHelpFormatter,
+        allow_abbrev=False,
     )
     parser.set_defaults(command=command.name)
     command.add_arguments(parser)

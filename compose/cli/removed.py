@@ -43,14 +43,11 @@ def another_scenario(_: str) -> NoReturn:
 
 
 def refuse_removed(words: Sequence[str]) -> None:
-    """Raise UserError if `words`, a command and its arguments, name something that was removed.
-
-    A flag may be abbreviated to two letters: with them, no other flag of its command begins.
-    """
-    if words[:1] == ["run"] and re.search(r" --see?d?[ =]\S+(,|\.\.)", " ".join(words)):
+    """Raise UserError if `words`, a command and its arguments, name something that was removed."""
+    if words[:1] == ["run"] and re.search(r" --seed[ =]\S+(,|\.\.)", " ".join(words)):
         raise removed("run --seed N..N")
-    flags = [word.partition("=")[0] for word in words[1:] if re.match("--..", word)]
+    flags = [word.partition("=")[0] for word in words[1:]]
     for row in REMOVED:
         command, _, flag = row.name.partition(" ")
-        if words[:1] == [command] and (not flag or (" " not in flag and any(map(flag.startswith, flags)))):
+        if words[:1] == [command] and (not flag or flag in flags):
             raise removed(row.name)

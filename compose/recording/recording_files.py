@@ -18,6 +18,8 @@ from protocol.messages import OfRobot
 from world.scenario import Scenario
 
 WORLD_JOURNAL = "world.journal"
+ESTIMATE_CSV = "estimate.csv"
+"""The file of `tandem estimate --out` that has the poses."""
 KINDS = Scenario | OfRobot
 """The kinds of messages in any journal."""
 
@@ -100,7 +102,9 @@ def user_errors(folder: Path) -> Iterator[None]:
     except OSError as error:
         journals = journals_in(folder)
         if isinstance(error, FileNotFoundError) and folder / WORLD_JOURNAL not in journals:
-            raise UserError(f"{folder} contains no recording: there is no {WORLD_JOURNAL}") from None
+            hint = "; `tandem watch` and `tandem export --tum` read the estimate in it"
+            hint = hint if (folder / ESTIMATE_CSV).exists() else ""
+            raise UserError(f"{folder} contains no recording: there is no {WORLD_JOURNAL}{hint}") from None
         where = (error.filename if journals else None) or folder
         raise UserError(f"{where} cannot be read: {error.strerror or error}") from None
     except CorruptJournal as error:

@@ -21,12 +21,10 @@ from compose.errors import BadRecording
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.ranging.range_steps import dead_reckoned
 from compose.recording.ranging.run_ranges import ranges_of_run
+from compose.recording.recording_files import ESTIMATE_CSV
 from compose.recording.rows import estimate_rows
 from compose.recording.run import Run
 from protocol import files
-
-ESTIMATE_CSV = "estimate.csv"
-"""The file of `tandem estimate --out` that has the poses."""
 
 
 def tum_of_run(run: Run) -> dict[str, str]:
