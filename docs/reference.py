@@ -340,7 +340,7 @@ def models(shipped: Mapping[str, type]) -> str:
         for one in inspect.signature(cls).parameters.values():
             value = "" if one.default is one.empty else f" = {msgspec.json.encode(one.default).decode()}"
             options.append(f"`{one.name}`{value}")
-        texts = [cls.__doc__ or "", getattr(cls.__init__, "__doc__", "") or "" if options else ""]
+        texts = [cls.__doc__ or "", getattr(vars(cls).get("__init__"), "__doc__", None) or ""]
         rows.append([f"`{name}`", ", ".join(options) or "-", " ".join(" ".join(texts).split())])
     return _table(["model", "options and defaults", "effect"], rows)
 
