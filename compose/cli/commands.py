@@ -198,7 +198,7 @@ def _connect_timeout(target: str) -> str:
 COMMANDS = (
     CommandEntry(
         *("run", "Run", "Run a mission on this machine."),
-        *("tandem run paper-1 --out recording", "docs/scenarios.md"),
+        *("tandem run paper-1 --out recording", "docs/tutorial-mission.md"),
         f"""{CHANGED_SCENARIO}
         others*
         {RUNNING}
@@ -215,12 +215,12 @@ COMMANDS = (
     ),
     CommandEntry(
         *("replay", "Run", "Run a recording again and compare it with the original bit by bit."),
-        *("tandem replay recording", "docs/recordings.md"),
+        *("tandem replay recording", "docs/howto-audit.md"),
         f"{RECORDING}{TRUSTED_PLANNER}",
     ),
     CommandEntry(
         *("scenarios", "Run", "List the scenarios and sweeps that ship with Tandem."),
-        *("tandem scenarios", "docs/scenarios.md"),
+        *("tandem scenarios", "docs/howto-scenario.md"),
         """
         --schema?: print the JSON Schema of scenario or sweep files instead, for editors [default: scenario]
         """,
@@ -232,7 +232,7 @@ COMMANDS = (
     ),
     CommandEntry(
         *("sweep", "Run", "Run many trials of a scenario, over ranges of its fields."),
-        *("tandem sweep noise --trials 50 --out results", "docs/sweeps.md"),
+        *("tandem sweep noise --trials 50 --out results", "docs/howto-sweep.md"),
         """
         spec SPEC: name of a sweep that ships with Tandem, or path of a TOML file
         --out DIR: folder for the results; an unfinished sweep in it is resumed [default: sweep-NAME]
@@ -320,12 +320,12 @@ COMMANDS = (
     ),
     CommandEntry(
         *("audit", "Analyse", "Check a recording against the rules of the system."),
-        *("tandem audit recording", "docs/recordings.md"),
+        *("tandem audit recording", "docs/howto-audit.md"),
         f"{RECORDING}{TRUSTED_PLANNER}",
     ),
     CommandEntry(
         *("figures", "Analyse", "Draw the figures of a recording."),
-        *("tandem figures recording --only encounter --format svg", "docs/recordings.md"),
+        *("tandem figures recording --only encounter --format svg", "docs/howto-figures.md"),
         f"""{RECORDING}{TRUSTED_PLANNER}
         --only NAME+: draw only this figure; may be repeated [default: all of {", ".join(PICTURES)}]
         --format+: write only this format; may be repeated [default: all of {", ".join(FIGURE_FORMATS)}]
@@ -336,7 +336,7 @@ COMMANDS = (
     ),
     CommandEntry(
         *("export", "Analyse", "Convert a recording to MCAP, CSV, Parquet or a factor graph."),
-        *("tandem export recording --out exported", "docs/recordings.md"),
+        *("tandem export recording --out exported", "docs/howto-export.md"),
         f"""{RECORDING}
         --out DIR: folder for the files [default: the recording's]
         --pyfg: write only run.pyfg: odometry, ranges and true poses as a factor graph for other estimators
@@ -379,7 +379,7 @@ COMMANDS = (
     ),
     CommandEntry(
         *("watch", "Analyse", "Serve a web page that shows recordings or live missions."),
-        *("tandem watch recording --port 8080\n  tandem watch paper assured", "docs/recordings.md"),
+        *("tandem watch recording --port 8080\n  tandem watch paper assured", "docs/howto-watch.md"),
         f"""
         recording DIR*: folder of a recording, of several recordings, of a sweep or of an estimate; two \
             recordings are shown side by side with one clock [default: live missions]
