@@ -143,9 +143,17 @@ def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_o
     assert captions[-1].text == "The mission ends, because measurements and reports contradict each other."
     assert [one.truth for one in captions if one.truth and "false data" in one.truth] == [
         "The simulated sensors are exact. a will report false data about itself.",
-        "a does report false data about itself.",
+        "a does report false data about itself. Believed, a would be 4.40 m off.",
     ]
     assert not any("localised" in one.text or "false data" in one.text for one in captions)
+
+
+def test_a_partition_is_told_when_it_begins_and_with_the_truth_only(recorded: Record) -> None:
+    run = recorded(load("paper-1", faults=["b->a: partition=true, ticks=2..5"]))
+    cuts = [(one.tick, cut) for one in scenes_of(run) for cut in one.captions if cut.kind == "cut"]
+    assert cuts == [
+        (2, Caption("cut", "", truth="From now on, no report from b to a arrives before tick 5."))
+    ]
 
 
 def test_kills_and_faults_of_every_kind_are_told(recorded: Record) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 from playwright.sync_api import Page, expect
 
-from tests.browser import INKS, Open, chromium_only, picture, shot, stop_clock, until_shown
+from compose.launch import in_process
+from compose.scenario.scenario_file import load
+from tests.browser import INKS, Open, chromium_only, picture, shot, stop_clock, until_shown, watching
 from tests.test_page_labels import SIZES, overlaps
 
 STEP_MS = 250
@@ -323,6 +326,17 @@ def test_with_reduced_motion_nothing_moves_between_two_ticks(opened: Open, addre
             pictures.setdefault((tick, caption), set()).add(picture_now(page))
     assert {tick for tick, _ in pictures} == {46, 47, 48}
     assert all(len(found) == 1 for (tick, _), found in pictures.items() if tick < 48)
+
+
+def test_the_server_tells_what_faults_cost_once_it_has_run_the_mission_without(
+    opened: Open, tmp_path: Path
+) -> None:
+    in_process.run_mission(load("random", faults=["loss=0.9"]), tmp_path)
+    with watching(tmp_path) as (_, address):
+        page = opened(f"{address}#tick=48")
+        expect(page.locator("#caption")).to_contain_text("Without lost reports, it takes 27 ticks, now 48.")
+        page.keyboard.press("t")
+        expect(page.locator("#caption")).not_to_contain_text("Without")
 
 
 def test_captions_do_not_tell_the_truth_if_it_is_hidden(opened: Open, address: str) -> None:

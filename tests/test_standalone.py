@@ -11,9 +11,11 @@ from playwright.sync_api import Browser, expect
 
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
+from compose.view.web import costs
 from compose.view.web.standalone import standalone_page
 from tests.browser import BOUND_MS, Open, chromium_only, picture, shot, until_shown
 from tests.commands import tandem
+from world.scenario import Scenario
 
 MOST_BYTES = 2_000_000
 """The largest size of the file for a mission of 100 ticks."""
@@ -71,6 +73,37 @@ def test_it_is_small_and_the_same_each_time(tmp_path: Path) -> None:
     page = standalone_page(tmp_path).html
     assert page == standalone_page(tmp_path).html
     assert len(page.encode()) < MOST_BYTES * max(1.0, run.length / 100)
+
+
+COSTS = [
+    (load("random", faults=["loss=0.9"]), "Without lost reports, it takes 27 ticks, now 48."),
+    (
+        load("paper-1", faults=["a->b: partition=true, ticks=40..60"]),
+        "Without the partition, the mission ends localised after 48 ticks.",
+    ),
+    (
+        load("paper-1", faults=["partition=true, ticks=2..5"]),
+        "Without the partition, it takes 48 ticks, too.",
+    ),
+    (load("paper-1"), None),
+]
+"""Scenarios, and what their faults cost."""
+
+
+@pytest.mark.parametrize(("scenario", "cost"), COSTS)
+def test_the_last_caption_says_what_faults_cost(scenario: Scenario, cost: str | None, tmp_path: Path) -> None:
+    in_process.run_mission(scenario, tmp_path)
+    page = standalone_page(tmp_path).html
+    assert ('"kind":"cost"' in page) == (cost is not None)
+    assert cost is None or f'"truth":"{cost}"' in page
+
+
+def test_a_cost_that_takes_too_long_to_compute_is_left_out(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(costs, "MOST_WALL_S", 0.0)
+    in_process.run_mission(COSTS[0][0], tmp_path)
+    assert '"kind":"cost"' not in standalone_page(tmp_path).html
 
 
 def test_no_text_of_a_run_ends_its_script(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ held, claimed and decided, and no more: a claim counts as true only once the mis
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Literal
 
 import msgspec
@@ -25,7 +25,7 @@ from protocol.motion import travelled
 CaptionKind = Literal[
     "rules", "ranging", "mirrored", "branch", "path", "search", "contact", "contact-lost", "configurations",
     "manoeuvre", "measured", "ruled-out", "claim", "undecided", "inconsistent", "down", "back", "late",
-    "report-lost", "report-damaged", "report-late", "report-doubled", "end",
+    "report-lost", "report-damaged", "report-late", "report-doubled", "cut", "end", "cost",
 ]  # fmt: skip
 FAULTS: dict[CaptionKind, str] = {
     "undecided": "robots do not claim their poses",
@@ -39,6 +39,8 @@ FAULTS: dict[CaptionKind, str] = {
     "report-doubled": "reports arrive more than once",
 }
 """The kinds of captions that tell events: verdicts without a claim, kills and faults; words for several."""
+LEAST_GAP_M = 1e-6
+"""The least distance in m between a reported and a true position that counts as a difference."""
 MOST_TOLD, MOST_LISTED_LINKS, MOST_LISTED_ROBOTS = 2, 2, 4
 """The largest numbers of events of one kind, of links and of robots that a caption tells one by one."""
 COUNTS = (
@@ -54,6 +56,7 @@ class Caption(msgspec.Struct, frozen=True, omit_defaults=True):
 
     kind: CaptionKind
     text: str
+    """The caption; empty if it is about the ground truth or the scenario only."""
     robots: tuple[str, ...] = ()
     """The robots that the caption is about; empty if it is about all."""
     truth: str | None = None
@@ -69,10 +72,12 @@ def captions(
     now: TickData,
     events: Sequence[Event],
     end: MissionEnd | None,
+    gaps: Mapping[str, float] | None = None,
 ) -> Told:
     """Yield the captions of the tick of `now`, and at last that of the end of the mission.
 
-    `events` are those of this tick, and `setup` has the present peers of robots. Claims with which all are
+    `events` are those of this tick, `setup` has the present peers of robots, and `gaps` how far from its true
+    position in m each attacker reports to be. Claims with which all are
     localised have no caption: that of the end is about them.
     """
     ended = end if end is not None and end.tick == now.tick else None
@@ -90,13 +95,14 @@ def captions(
         units = [(pair, TOLD_OF_PAIRS) for pair in pairs]
     over = ended is not None and ended.outcome == "localised"
     for robots, story in units:
-        group = PairData(robots, setup, before, now, events)
+        group = PairData(robots, setup, before, now, events, gaps or {})
         untold = OF_PHASES if group.own_planner else ()
         for tell in story:
             if tell not in untold:
                 for caption in tell(group):
                     if not (over and caption.kind == "claim"):
                         yield caption
+    yield from cutting(setup, now)
     if not setup.visits:  # of the world
         yield from happening(PairData((), setup, before, now, [one for one in events if one.robot is None]))
     if ended is not None:
@@ -127,6 +133,13 @@ def attacked(group: PairData, reports: str) -> str | None:
     """Return a sentence about the attackers; None if there are none. `reports` is its verb."""
     attackers = [robot.id for robot in group.robots if robot.attack is not None]
     return f"{listed(attackers)} {reports} false data about itself." if attackers else None
+
+
+def believed(group: PairData) -> str | None:
+    """Return how far off the positions would be that attackers report; None if none is off."""
+    off = [(robot, gap) for robot in group.ids if (gap := group.gaps.get(robot, 0.0)) >= LEAST_GAP_M]
+    places = listed([f"{robot} would be {metres(gap)} off" for robot, gap in off], "robots would be off")
+    return f"Believed, {places}." if off else None
 
 
 # --- phases 1 and 2 ---------------------------------------------------------------------------------
@@ -361,7 +374,8 @@ def meeting(pair: PairData) -> Told:
     if alone and now.range is not None and not pair.setup.visits:
         still = f"while {standing[0]} stands still"
         text += [f"{driving[0]} drives on to measure a second distance, {still}."]
-    yield Caption("contact", " ".join(text), pair.ids)
+    just_told = any(event.kind == "inconsistent" for event in pair.events)
+    yield Caption("contact", " ".join(text), pair.ids, None if just_told else believed(pair))
 
 
 def fitting(pair: PairData) -> Told:
@@ -469,6 +483,7 @@ def happening(group: PairData) -> Told:
     if not group.events:
         return
     attackers = attacked(group, "does report") or "No robot reports false data."
+    attackers = " ".join(filter(None, [attackers, believed(group)]))
     mine = None if group.setup.visits else group.ids or None
     for kind, several in FAULTS.items():
         found = [one for one in group.events if one.kind == kind and (mine is None or one.robot in mine)]
@@ -477,6 +492,19 @@ def happening(group: PairData) -> Told:
             text = many if len(found) > MOST_TOLD else " ".join([stopped(one.text) for one in found])
             whom = tuple(sorted({one.robot for one in found if one.robot is not None}))
             yield Caption(kind, text, mine or whom, attackers if kind == "inconsistent" else None)
+
+
+def cutting(setup: RunSetup, now: TickData) -> Told:
+    """Yield the partitions that begin in this tick, which only the scenario tells."""
+    for fault in setup.faults:
+        if fault.partition and fault.ticks is not None and fault.ticks[0] == now.tick:
+            whose = ""
+            if (link := fault.link) is not None:
+                between, and_ = ("between", "and") if link.both else ("from", "to")
+                whose = f" {between} {link.sender} {and_} {link.receiver}"
+            yield Caption(
+                "cut", "", truth=f"From now on, no report{whose} arrives before tick {fault.ticks[1]}."
+            )
 
 
 Teller = Callable[[PairData], Told]

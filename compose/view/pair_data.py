@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 
 import msgspec
 
@@ -25,6 +25,8 @@ class PairData(msgspec.Struct, frozen=True):
     now: TickData
     events: Sequence[Event] = ()
     """The events of this tick."""
+    gaps: Mapping[str, float] = {}
+    """How far from its true position, in m, each attacker reports to be."""
 
     @property
     def ids(self) -> tuple[str, ...]:

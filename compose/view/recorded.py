@@ -4,10 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+from msgspec.structs import replace
+
 from compose.errors import UserError
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, robot_of
 from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup
+from compose.view.captions import Caption
 from compose.view.reported import reported_paths
 from compose.view.run_data import RunData
 from compose.view.scene import Scene, scene
@@ -47,7 +50,11 @@ def scenes(setup: RunSetup, known: RunData, first: int = 0, last: int | None = N
     for tick in known.between(first, last):
         before, now = known.ticks.get(tick - 1), known.ticks[tick]
         reported = {robot: path[tick] for robot, path in paths.items() if tick < len(path)}
-        shown.append(scene(known.setup_at(setup, tick), before, now, known.end, reported))
+        found = scene(known.setup_at(setup, tick), before, now, known.end, reported)
+        if known.end is not None and tick == known.end.tick and known.costs:
+            cost = Caption("cost", "", truth=" ".join(known.costs))
+            found = replace(found, captions=(*found.captions, cost))
+        shown.append(found)
     return tuple(shown)
 
 

@@ -77,6 +77,8 @@ class RunData:
         self.end: MissionEnd | None = None
         self.last = -1
         """The latest tick with any data; -1 if there is none."""
+        self.costs: tuple[str, ...] = ()
+        """What each fault, attack and kill has cost, as sentences; empty until it is known."""
         self.has_truth = False
         """True once the ground truth of any tick is known."""
         self._seen: set[str | None] = set()
@@ -133,6 +135,12 @@ class RunData:
             self.end = end
             if end.tick in self.ticks:
                 self._touch(end.tick)
+
+    def add_costs(self, costs: Iterable[str]) -> None:
+        """Add what faults have cost to the last tick of a mission that has ended."""
+        self.costs = tuple(costs)
+        if self.costs and self.end is not None:
+            self._touch(self.end.tick)
 
     def add_world(self, world: World) -> None:
         """Add the ground truth of the world's current tick."""

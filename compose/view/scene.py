@@ -192,6 +192,7 @@ def scene(
     """
     false_poses = reported or {}
     players = tuple([player_of(one, setup, now, false_poses.get(one.id)) for one in setup.robots])
+    gaps = {one.robot: one.reported.gap for one in players if one.reported is not None}
     deliveries = tuple(passages(setup, now))
     found = tuple(events(setup, before, now, deliveries, end))
     return Scene(
@@ -199,7 +200,7 @@ def scene(
         players,
         deliveries,
         found,
-        tuple(captions(setup, before, now, found, end)),
+        tuple(captions(setup, before, now, found, end, gaps)),
         tuple(configurations(setup, before, now)),
     )
 

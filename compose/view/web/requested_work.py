@@ -24,7 +24,7 @@ MOST_MEMORY_BYTES = 4 << 30
 """The largest size in bytes of the data of a process."""
 MOST_FILE_BYTES = 1 << 30
 """The largest size in bytes of a file that it writes."""
-FUNCTIONS = ("compose.view.web.reruns", "compose.view.web.site")
+FUNCTIONS = ("compose.view.web.reruns", "compose.view.web.site", "compose.view.web.costs")
 """The modules of the functions that are called."""
 MISSION_MODULES = ("compose.launch.in_process", "compose.scenario.scenario_file")
 """The modules that run a mission. They import numpy, which the server itself does not need."""

@@ -82,6 +82,8 @@ class _Answers:
         """Held while a request is computed: one at a time."""
         self._waiting = 0
         """The number of requests that are computed, or wait until they are."""
+        self._costs: dict[str, asyncio.Task[None]] = {}
+        """The computations of what faults have cost, by the name of the mission."""
 
     async def _computed(self, work: Callable[..., T], *arguments: Any) -> T:
         """Return the result of `work` in a thread. Raises _Refused if MOST_WAITING requests wait already."""
@@ -159,7 +161,15 @@ class _Answers:
         return show
 
     async def show(self, request: Request) -> Response:
-        return _json(self._show(request)[0].mission)
+        """Return a mission, and begin to compute what its faults have cost, once it has ended."""
+        show, _ = self._show(request)
+        if not show.live and show.name not in self._costs:
+            self._costs[show.name] = asyncio.create_task(self._add_costs(show))
+        return _json(show.mission)
+
+    async def _add_costs(self, show: WatchedRun) -> None:
+        show.known.add_costs(await asyncio.to_thread(self._site.costs_of, show))
+        show.revised()
 
     async def thumbnail(self, request: Request) -> Response:
         show, setup = self._show(request)

@@ -14,6 +14,7 @@ from compose.recording.comparison import comparison
 from compose.recording.recording_files import journals_in
 from compose.recording.run import read
 from compose.view.web import results_page
+from compose.view.web.costs import costs
 from compose.view.web.live import Listener
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.reruns import ChangedMissions, Trials
@@ -102,6 +103,11 @@ class Site:
         folders = [str(show.folder) for show in self.recorded]
         late = f"the recordings are not compared after {COMPARISON_S:g} s: use `tandem.open`"
         return {**self.work.result(compared, *folders, within=COMPARISON_S, late=late), "names": folders}
+
+    def costs_of(self, show: WatchedRun) -> list[str]:
+        """Return what the faults of a complete recording with a scenario have cost, as sentences."""
+        scenario = show.scenario if isinstance(show, Recorded) and not show.live else None
+        return costs(scenario, show.known, self.work) if scenario is not None else []
 
     def start(self) -> None:
         """Start listening on the network."""

@@ -39,6 +39,7 @@ def standalone_page(folder: Path) -> StandalonePage:
         raise UserError(f"{folder} is not the folder of one recording")
     (show,) = shows.values()
     assert show.setup is not None
+    show.known.add_costs(site.costs_of(show))
     show.live = False  # the file does not change, even if the run goes on
     recording = {
         "list": site.listed(),

@@ -13,7 +13,7 @@ const ALMOST = 0.999;
 const HOLDS_S = 45; // all captions together
 // Captions of kills and faults are no part of the story, which goes on after them. Time stops at each kill, and at the
 // first fault of each kind.
-const KILLS = new Set(["down", "back"]);
+const KILLS = new Set(["down", "back", "cut"]);
 const FAULTS = new Set([...KILLS, "late", "report-lost", "report-damaged", "report-late", "report-doubled"]);
 
 export class Guide {
@@ -42,8 +42,8 @@ export class Guide {
   }
 
   /** Returns the captions of `tick` about the pair or about all robots. */
-  captions({ tick, focus }) {
-    return this.#about(this.store.scene(tick)?.captions ?? [], focus);
+  captions({ tick, focus, truth }) {
+    return this.#about(this.store.scene(tick)?.captions ?? [], focus).filter((one) => one.text || truth);
   }
 
   #about(captions, focus) {
@@ -62,7 +62,7 @@ export class Guide {
   /** Returns the text to show: the current caption, all captions of the tick if time has stopped, or the latest one. */
   text(view) {
     this.#read();
-    const here = this.captions(view), with_truth = ({ text, truth }) => (view.truth && truth ? `${text} ${truth}` : text);
+    const here = this.captions(view), with_truth = ({ text, truth }) => [text, view.truth && truth].filter(Boolean).join(" ");
     if (view.beat !== null && here.length) return with_truth(here[Math.min(view.beat, here.length - 1)]);
     if (here.length) return here.map(with_truth).join(" ");
     for (let i = this.beats.length - 1; i >= 0; i--) {
