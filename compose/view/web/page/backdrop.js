@@ -3,6 +3,7 @@
 
 import { TAU } from "./geometry.js";
 import { draw_tree } from "./group.js";
+import { DASHED } from "./pen.js";
 import { kinds_of } from "./trails.js";
 import { metres } from "./words.js";
 
@@ -97,7 +98,7 @@ export class Backdrop {
     pen.stroke();
     pen.beginPath();
     pen.arc(...(robot.told ? plane.at(robot.told) : [x, y]), (robot.orbit?.[0] ?? 3 * robot.sigma) * plane.scale, 0, TAU);
-    pen.setLineDash([7, 4, 1.5, 4]);
+    pen.setLineDash(DASHED);
     pen.lineWidth = 1;
     pen.strokeStyle = look.orbit;
     pen.stroke();

@@ -4,7 +4,7 @@ import { shown } from "./configurations.js";
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
 import { held_now, lacks_bearing } from "./held.js";
 import { NAME } from "./labels.js";
-import { cross, fading, shape } from "./pen.js";
+import { cross, DOTTED, fading, OUTLINED, shape } from "./pen.js";
 import { metres, probability } from "./words.js";
 
 const FADING = 3;
@@ -46,7 +46,7 @@ export class Beliefs {
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
       pen.strokeStyle = colour;
       pen.lineWidth = tints.length ? 2.6 : 2;
-      pen.setLineDash(held.world.length || !truth || size <= 6 ? [] : [3, 3]);
+      pen.setLineDash(held.world.length || !truth || size <= 6 ? [] : OUTLINED);
       pen.stroke();
       pen.setLineDash([]);
       const many = held.probability.length > 1 && chance > 0.01;
@@ -120,7 +120,7 @@ export class Beliefs {
     pen.strokeStyle = look.ghost;
     pen.lineWidth = 3;
     pen.globalAlpha = truth ? fading(share, moving) : 1; // the true robot leaves the circle
-    pen.setLineDash([2, 6]);
+    pen.setLineDash(DOTTED);
     pen.stroke();
     pen.setLineDash([]);
     pen.globalAlpha = 1;
@@ -137,7 +137,7 @@ export class Beliefs {
     pen.strokeStyle = look.ghost;
     pen.globalAlpha = 0.5;
     pen.lineWidth = 2;
-    pen.setLineDash([2, 6]);
+    pen.setLineDash(DOTTED);
     pen.stroke();
     pen.setLineDash([]);
     pen.globalAlpha = 1;
@@ -171,7 +171,7 @@ export class Beliefs {
         shape(pen, robot.role, x, y, pose[2], size * 1.3);
         pen.strokeStyle = look.ghost;
         pen.lineWidth = 1.4;
-        pen.setLineDash([2, 3]);
+        pen.setLineDash(OUTLINED);
         pen.stroke();
         pen.setLineDash([]);
         cross(pen, x, y, size, look);

@@ -206,7 +206,7 @@ function received_from([peer, , heard, damaged]) {
   return damaged.length ? `${intact}; damaged: report of ${ticks(damaged)}` : intact;
 }
 
-const commanded = ({ v, omega, state }) => `${state}: ${v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`}`;
+const commanded = ({ v, omega }) => (v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`);
 
 function believed({ local, world, probability: chances, covariance, localised }) {
   const sigma = covariance && world.length ? `, sigma ${metres(Math.sqrt(Math.max(0, covariance[0] + covariance[3])))}` : "";

@@ -3,7 +3,7 @@
 import { make } from "./cards.js";
 import * as data from "./data.js";
 import { distance, TAU } from "./geometry.js";
-import { shape } from "./pen.js";
+import { DASHED, OUTLINED, shape } from "./pen.js";
 
 /** The distance in pixels from a handle within which a pointer takes it. */
 const REACH_PX = 12;
@@ -176,13 +176,13 @@ export class Changes {
       pen.fill();
       pen.stroke();
       if (robot === this.robot.value) {
-        pen.setLineDash([2, 3]);
+        pen.setLineDash(OUTLINED);
         pen.beginPath();
         pen.arc(px, py, REACH_PX + 2, 0, TAU);
         pen.stroke();
       }
       if (x === "x") continue;
-      pen.setLineDash([6, 5]);
+      pen.setLineDash(DASHED);
       pen.lineWidth = 1.5;
       pen.beginPath();
       pen.arc(px, py, this.values.sensing_range * plane.scale, 0, TAU);

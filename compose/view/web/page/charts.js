@@ -1,7 +1,7 @@
 // The charts: six strips with the numbers of a pair of robots over time. A click or a drag goes to a tick.
 
 import * as data from "./data.js";
-import { unit } from "./pen.js";
+import { DASHED, unit } from "./pen.js";
 import { metres, probability } from "./words.js";
 
 const TOP = 17;
@@ -21,7 +21,7 @@ const LEAST_M = 1e-4;
 const REFRESH_MS = 250;
 const RETRY_MS = 2000;
 /** The dashes of a line by role, so that two robots differ without colour. */
-const DASHES = { a: [], b: [5, 3] };
+const DASHES = { a: [], b: DASHED };
 /** A strip: its title, its curves, its scale, the text of a value, and the sentence in place of no curves. */
 const STRIPS = [
   {

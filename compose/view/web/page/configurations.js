@@ -3,7 +3,7 @@
 
 import { between, compose, distance, step } from "./geometry.js";
 import { held_now } from "./held.js";
-import { circle, DASHES } from "./pen.js";
+import { circle, DASHED } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 
 const MOST = 12; // configurations that are drawn
@@ -90,7 +90,7 @@ export class Configurations {
         const away = Math.atan2(opposite[1] - centre[1], centre[0] - opposite[0]);
         const colour = look.tint(one.tint), angle = away + (i - (live.length - 1) / 2) * NEXT_NUMBER;
         pen.globalAlpha = one.out ? 0.2 : 0.9;
-        circle(this.plane, centre, one.predicted, colour, 1.6, DASHES[one.tint] ?? DASHES[0]);
+        circle(this.plane, centre, one.predicted, colour, 1.6, DASHED);
         const [x, y] = this.plane.at(centre), radius = one.predicted * this.plane.scale;
         if (one.out) return;
         pen.globalAlpha = 1;

@@ -1,7 +1,7 @@
 // Why exact distances leave several hypotheses: the mirror images of phase 1, and the crossings of an encounter.
 
 import { compose, distance, frame_of, step, TAU, wrap } from "./geometry.js";
-import { circle } from "./pen.js";
+import { circle, DASHED, DOTTED } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 import { metres } from "./words.js";
 
@@ -70,7 +70,7 @@ export class Construction {
     const start = found.ways[0].find((pose, i) => distance(pose, found.ways[1][i]) < 1e-6);
     if (start) {
       const reach = (AXIS * largest) / Math.max(distance(start, [x, y]), 1e-9), end = (sign) => this.plane.at([x + sign * reach * (start[0] - x), y + sign * reach * (start[1] - y)]);
-      this.#line([end(-1), end(1)], look.faint, 1, [9, 3, 2, 3]);
+      this.#line([end(-1), end(1)], look.faint, 1, DASHED);
     }
     for (const way of found.ways) this.#line(way.map((pose) => this.plane.at(pose)), look.ghost, 1.6, []);
     for (const mark of start ? ["places", "axis"] : ["places"]) this.plane.marks.add(mark);
@@ -86,8 +86,8 @@ export class Construction {
     if (!found) return () => true;
     const angle = turned * TAU, about = ([x, y]) => compose([...found.anchor, angle], [x - found.anchor[0], y - found.anchor[1], 0]);
     this.plane.marks.add("crossing");
-    circle(this.plane, ...found.circle, look.ghost, 2, [2, 6]);
-    for (const place of found.places) circle(this.plane, found.anchor, distance(place, found.anchor), look.ghost, 1, [3, 4]);
+    circle(this.plane, ...found.circle, look.ghost, 2, DOTTED);
+    for (const place of found.places) circle(this.plane, found.anchor, distance(place, found.anchor), look.ghost, 1, DASHED);
     if (turned < 1) {
       const path = found.path.map(about), met = found.turns.some((turn) => Math.abs(wrap(turn - angle)) < PASSING);
       found.distances.forEach((range, i) => circle(this.plane, path[i], range, met ? look.ink : look.link, met ? 2 : 1.2));

@@ -1,6 +1,7 @@
 // What the page shows of a group: who localises whom, and how many robots are localised.
 
 import { distance } from "./geometry.js";
+import { DOTTED } from "./pen.js";
 import { joined } from "./tints.js";
 import { plural } from "./words.js";
 
@@ -26,7 +27,7 @@ export function draw_tree(pen, plane, { store, tick, look }) {
     pen.strokeStyle = pen.fillStyle = done ? look.robot.a : look.orbit;
     pen.globalAlpha = done ? 0.75 : 0.8;
     pen.lineWidth = done ? 1.3 : 1;
-    pen.setLineDash(done ? [] : [1.5, 5]);
+    pen.setLineDash(done ? [] : DOTTED);
     pen.beginPath();
     pen.moveTo(...at(reach + 2)); pen.lineTo(...at(tip - HEAD));
     pen.stroke();

@@ -9,6 +9,7 @@ const WIDE_PX = 900;
 const drawn = (inside) => `<svg viewBox="0 0 30 16" aria-hidden="true">${inside}</svg>`;
 const line = (colour, more = "") => drawn(`<path d="M1 8h28" fill="none" stroke="var(--${colour})" stroke-width="2" ${more}/>`);
 const ring = (colour, more = "") => drawn(`<circle cx="15" cy="8" r="6" fill="none" stroke="var(--${colour})" stroke-width="1.8" ${more}/>`);
+const GLOW = '<path d="M1 8h28" stroke="var(--now)" stroke-width="8"/>';
 const POINTED = 'd="M23 8 8 14l4-6-4-6z"';
 const ROUND = 'd="M22 8 17.5 3.5a6.4 6.4 0 1 0 0 9z"';
 const dot = (more) => drawn(`<circle cx="15" cy="8" r="4.5" stroke-width="1.8" ${more}/>`);
@@ -23,36 +24,36 @@ const LASTING = {
   meeting: [drawn('<path d="M1 8h20" stroke="var(--robot-a)" stroke-width="1.3"/><path d="M28 8l-7 3v-6z" fill="var(--robot-a)"/>'), "who localises whom; dotted: planned"],
   anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor (beacon); range ${range}`],
   unsurveyed: [drawn('<path d="M15 4.5l3.5 6h-7z" fill="var(--paper)" stroke="var(--ink)"/>'), "anchor at a position that robots do not know"],
-  orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="5 2.5 1 2.5"/>'), ({ own }) => (own ? "orbit" : "search circle (phase 2)")],
+  orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="6 4"/>'), ({ own }) => (own ? "orbit" : "search circle (phase 2)")],
   "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), ({ own, team }) => (team ? "path, not located" : `path, phase 1${own ? "" : ": near anchor"}`)],
   "path-2": [line("faint", 'stroke-dasharray="6 4"'), ({ own, team }) => (team ? "path to another anchor" : `path, phase 2${own ? "" : ": search"}`)],
   "path-3": [line("faint"), ({ own, team }) => (team ? "path, located" : `path, phase 3${own ? "" : ": encounter"}`)],
-  reported: [line("fault", 'stroke-dasharray="3 3"'), "path that an attacker reports"],
+  reported: [line("fault", 'stroke-dasharray="6 4"'), "path that an attacker reports"],
 };
 /** The other marks. */
 const MOMENTARY = {
   down: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-width="2"/><path d="${cross}" stroke="var(--fault)" stroke-width="2"/>`), "robot whose process is gone"],
-  places: [drawn('<circle cx="15" cy="8" r="6.5" fill="none" stroke="var(--ghost)" stroke-width="2.4" stroke-dasharray="1.6 2.5"/><path d="M15 5.5l2.5 4.3h-5z" fill="var(--ink)"/>'), "all places at the measured distance"],
-  axis: [line("faint", 'stroke-width="1" stroke-dasharray="7 2 2 2"'), "mirror axis: distances to the anchor do not tell its sides apart"],
-  crossing: [drawn('<circle cx="10" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-dasharray="3 2.4"/><circle cx="20" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-width="2" stroke-dasharray="1.6 2.5"/>'), "turned about its anchor, the driven path fits where the circles cross"],
-  distance: [line("range"), ({ team }) => `distance to ${team ? "an" : "the"} anchor`],
+  places: [drawn('<circle cx="15" cy="8" r="6.5" fill="none" stroke="var(--ghost)" stroke-width="2.4" stroke-dasharray="1.5 4"/><path d="M15 5.5l2.5 4.3h-5z" fill="var(--ink)"/>'), "all places at the measured distance"],
+  axis: [line("faint", 'stroke-width="1" stroke-dasharray="6 4"'), "mirror axis: distances to the anchor do not tell its sides apart"],
+  crossing: [drawn('<circle cx="10" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-dasharray="6 4"/><circle cx="20" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-width="2" stroke-dasharray="1.5 4"/>'), "turned about its anchor, the driven path fits where the circles cross"],
+  distance: [drawn(`${GLOW}<path d="M1 8h28" stroke="var(--range)" stroke-width="2"/>`), ({ team }) => `distance to ${team ? "an" : "the"} anchor`],
   turned: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-opacity="0.7"/>`), "turned around the anchor: just as possible"],
-  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="2.5 2"/>`), "hypothesis: a pose (place and heading) that a robot may have"],
-  "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="2 2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
+  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="3 2.2"/>`), "hypothesis: a pose (place and heading) that a robot may have"],
+  "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="3 2.2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
   ellipse: [drawn('<ellipse cx="15" cy="8" rx="12" ry="5.5" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma)"],
   arc: [drawn('<path d="M2 13q13-15 26 0l-4 2q-9-9-18 0z" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma): along an arc"],
   located: [drawn('<circle cx="15" cy="8" r="6.5" fill="var(--cloud)" stroke="var(--ghost)"/><circle cx="15" cy="8" r="2" fill="var(--ghost)"/>'), "where a robot has located an anchor (3 sigma)"],
-  contact: [drawn('<path d="M1 6h28M1 10h28" stroke="var(--link)" stroke-width="1.4"/>'), "in range of each other"],
-  reach: [ring("link", 'stroke-dasharray="3 2.4"'), ({ range }) => `range between robots: ${range}`],
+  contact: [drawn(`${GLOW}<path d="M1 6h28M1 10h28" stroke="var(--link)" stroke-width="1.4"/>`), "in range of each other"],
+  reach: [ring("link", 'stroke-dasharray="6 4"'), ({ range }) => `range between robots: ${range}`],
   report: [dot('fill="var(--link)"'), ({ team }) => `report to ${team ? "another" : "the other"} robot`],
   late: [drawn('<path d="M4 8h11" stroke="var(--link)" stroke-width="4"/><circle cx="17" cy="8" r="4.5" fill="var(--link)"/>'), "report that arrives late"],
   waiting: [dot('fill="none" stroke="var(--link)"'), "report under way"],
-  lost: [dot('fill="none" stroke="var(--fault)" stroke-dasharray="2 2"'), "report that is lost"],
+  lost: [dot('fill="none" stroke="var(--fault)" stroke-dasharray="3 2.2"'), "report that is lost"],
   damaged: [drawn(`<circle cx="15" cy="8" r="5" fill="none" stroke="var(--fault)" stroke-width="1.6"/><path d="${cross}" stroke="var(--fault)"/>`), "report that arrives damaged"],
   configuration: [drawn('<path d="M5 8h20" stroke="var(--tint-1)"/><circle cx="5" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/><circle cx="25" cy="8" r="3.6" fill="var(--card)" stroke="var(--tint-1)" stroke-width="2"/>'), "hypothesis: a pose of each robot, in one colour"],
   reachable: [drawn('<path d="M3 13q12-14 24-4" fill="none" stroke="var(--faint)" stroke-width="4"/>'), ({ mover }) => `where ${mover} could drive; thick: predictions differ more`],
   choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), ({ mover }) => `manoeuvre chosen by ${mover}`],
-  predicted: [drawn('<circle cx="15" cy="8" r="6" fill="none" stroke="var(--tint-1)" stroke-width="1.8" stroke-dasharray="4 2.5"/><path d="M15 8h6" stroke="var(--tint-1)"/>'), "distance that a hypothesis predicts"],
+  predicted: [drawn('<circle cx="15" cy="8" r="6" fill="none" stroke="var(--tint-1)" stroke-width="1.8" stroke-dasharray="6 4"/><path d="M15 8h6" stroke="var(--tint-1)"/>'), "distance that a hypothesis predicts"],
   measured: [ring("ink", 'style="stroke-width: 4; opacity: 0.2"'), "measured distance"],
 };
 /** The drawing of the bands of the time line. */

@@ -23,8 +23,19 @@ export function shape(pen, role, x, y, heading, size) {
 /** Returns the opacity of a range, which fades until the next tick. */
 export const fading = (share, moving) => (moving ? Math.max(0, 1 - 1.6 * share) : 1);
 
-/** The dashes of the circle that a configuration predicts, by its number from 0, so that circles differ without colour. */
-export const DASHES = [[6, 4], [12, 4], [2, 4], [10, 3, 2, 3]];
+/** The two styles of broken lines in pixels: what is searched or unknown is dotted, what is planned or possible is dashed. */
+export const DOTTED = [1.5, 5], DASHED = [7, 5];
+/** The dashes of the outline of a robot. */
+export const OUTLINED = [3, 2.2];
+
+/** Draws a line below the measurements of this tick in the one colour of what is now. */
+export function glow(pen, look, from, to) {
+  pen.beginPath();
+  pen.moveTo(...from); pen.lineTo(...to);
+  pen.strokeStyle = look.now;
+  pen.lineWidth = 8;
+  pen.stroke();
+}
 
 /** Draws a circle about a place of the plane; `radius` is in m, `width` and `dash` are in pixels. */
 export function circle(plane, centre, radius, colour, width, dash = []) {
@@ -51,7 +62,7 @@ export function cross(pen, x, y, size, look) {
 export class Look {
   constructor(style) {
     const of = (name) => style.getPropertyValue(`--${name}`).trim();
-    for (const name of ["ink", "paper", "faint", "grid", "disc", "ring", "orbit", "ghost", "cloud", "range", "link", "fault"]) {
+    for (const name of ["ink", "paper", "faint", "grid", "disc", "ring", "orbit", "ghost", "cloud", "range", "link", "fault", "now"]) {
       this[name] = of(name);
     }
     this.robot = { a: of("robot-a"), b: of("robot-b") };

@@ -8,7 +8,7 @@ import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
 import { heads, links } from "./group.js";
 import { Labels, NAME } from "./labels.js";
-import { cross, Look, shape, unit } from "./pen.js";
+import { cross, Look, OUTLINED, shape, unit } from "./pen.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
@@ -314,7 +314,7 @@ export class Plane {
     pen.fillStyle = look.paper;
     pen.fill();
     pen.lineWidth = 1.5;
-    pen.setLineDash([3, 2]);
+    pen.setLineDash(OUTLINED);
     pen.stroke();
     pen.setLineDash([]);
     const text = `${robot.id} reported, ${metres(distance(pose, true_pose))} off`;

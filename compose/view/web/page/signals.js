@@ -2,7 +2,7 @@
 
 import { distance, TAU } from "./geometry.js";
 import { held_now, leads } from "./held.js";
-import { fading } from "./pen.js";
+import { DASHED, fading, glow, OUTLINED } from "./pen.js";
 import { metres } from "./words.js";
 
 const MOST_ORIGINS = 6;
@@ -34,6 +34,7 @@ export class Signals {
     const pen = this.plane.context, from = this.plane.at(pose), to = this.plane.at(anchor);
     this.plane.marks.add("distance");
     pen.globalAlpha = alpha;
+    glow(pen, look, from, to);
     pen.beginPath();
     pen.moveTo(...from); pen.lineTo(...to);
     pen.strokeStyle = look.range;
@@ -63,7 +64,7 @@ export class Signals {
     pen.globalAlpha = fading(share, moving) * (poses.length > 1 ? 0.6 : 1);
     pen.strokeStyle = look.link;
     pen.lineWidth = 1.5;
-    pen.setLineDash([6, 5]);
+    pen.setLineDash(DASHED);
     for (const pose of poses) {
       pen.beginPath();
       pen.arc(...this.plane.at(pose), radius, 0, TAU);
@@ -86,6 +87,7 @@ export class Signals {
     if (length < 1) return;
     const across = [-(other[1] - one[1]) / length, (other[0] - one[0]) / length];
     pen.globalAlpha = focus && robot.id !== focus && peer !== focus ? 0.4 : 1;
+    if (contact[1] !== null && !(moving && share > LABELLED)) glow(pen, look, one, other);
     for (const side of [-3.5, 3.5]) {
       pen.beginPath();
       pen.moveTo(one[0] + side * across[0], one[1] + side * across[1]);
@@ -117,7 +119,7 @@ export class Signals {
     pen.globalAlpha = 0.6 * alpha * before;
     pen.strokeStyle = look.link;
     pen.lineWidth = 1.2;
-    pen.setLineDash([5, 4]);
+    pen.setLineDash(DASHED);
     pen.beginPath();
     pen.arc(...this.plane.at(place), radius, 0, TAU);
     pen.stroke();
@@ -166,7 +168,7 @@ export class Signals {
     pen.fill();
     pen.strokeStyle = sign === "lost" || sign === "damaged" ? look.fault : look.link;
     pen.lineWidth = 1.8;
-    pen.setLineDash(sign === "lost" ? [2, 2] : []);
+    pen.setLineDash(sign === "lost" ? OUTLINED : []);
     pen.stroke();
     pen.setLineDash([]);
     if (sign === "damaged") {

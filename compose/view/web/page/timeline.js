@@ -127,10 +127,9 @@ export class Timeline {
         } else {
           pen.fillRect(left, y + (band - inner) / 2, width, inner);
         }
-        if (width > 54 && band > 10) {
-          pen.fillStyle = value === 3 ? of("paper") : of("faint");
-          if (value < 0) pen.fillText("down", left + 5, y + band - 3.5);
-          if (value === 3 && store.stage.team) pen.fillText("located", left + 5, y + band - 3.5);
+        if (value < 0 && width > 54 && band > 10) {
+          pen.fillStyle = of("faint");
+          pen.fillText("down", left + 5, y + band - 3.5);
         }
       }
       pen.textAlign = "center";
@@ -153,6 +152,8 @@ export class Timeline {
     this.#signs(pen, x, of, ids, wide);
     this.#ticks(pen, x, MARKS + shown.length * (band + 3) + 11, of("faint"), wide);
     const now = x(Math.min(tick + (moving ? share : 0), this.last));
+    pen.fillStyle = of("now");
+    pen.fillRect(now - 4, MARKS - 2, 8, tall - MARKS - 13);
     pen.fillStyle = of("ink");
     pen.fillRect(now - 1, MARKS - 6, 2, tall - MARKS - 9);
     pen.beginPath();

@@ -3,11 +3,13 @@
 
 import { between, compose, controls, inverse, TAU } from "./geometry.js";
 import { held_now, lacks_bearing, leads } from "./held.js";
-import { fading, shape, unit } from "./pen.js";
+import { DASHED, DOTTED, fading, shape, unit } from "./pen.js";
 
-const TRAIL = { 1: { dash: [1.5, 4.5], width: 2.4 }, 2: { dash: [8, 5.5], width: 2 }, 3: { dash: [], width: 2.6 } };
-const REPORTED_STYLE = { dash: [4, 4], width: 1.3 };
+const TRAIL = { 1: { dash: DOTTED, width: 2.4 }, 2: { dash: DASHED, width: 2 }, 3: { dash: [], width: 2.6 } };
+const REPORTED_STYLE = { dash: DASHED, width: 1.3 };
 const CHUNK = 64;
+/** The age in ticks from which on a path fades no more, its opacity then, and the ticks of which one piece has one opacity. */
+const OLD = 48, PAST = 0.3, STEP = 8;
 const BENDS = 6;
 const MOST_TRAILS = 6;
 /** The number of directions in which a path is shown, and later a robot, while its bearing from the anchor is unknown. */
@@ -47,9 +49,11 @@ export class Trails {
   trail(pen, view, robot, kind) {
     const { store, tick } = view, last = Math.min(tick, store.last);
     this.#stroked(pen, view, robot, kind, (stroke) => {
-      for (let from = store.first; from < last; from += CHUNK) {
-        const to = Math.min(from + CHUNK, last);
-        for (const piece of this.#pieces(store, robot, kind, from, to, to === from + CHUNK)) stroke(piece);
+      for (let from = store.first; from < last;) {
+        const long = from + CHUNK <= last - OLD && (from - store.first) % CHUNK === 0, end = from + (long ? CHUNK : STEP), to = Math.min(end, last);
+        const strength = PAST + (1 - PAST) * Math.max(0, 1 - Math.max(0, last - end) / OLD);
+        for (const piece of this.#pieces(store, robot, kind, from, to, to === end)) stroke(piece, strength);
+        from = to;
       }
     });
   }
@@ -110,8 +114,9 @@ export class Trails {
     pen.save();
     pen.globalAlpha = faint ? 0.4 : 0.95;
     pen.setTransform(ratio * s, 0, 0, -ratio * s, ratio * (wide / 2 - centre[0] * s), ratio * (height / 2 + centre[1] * s));
-    draw(({ path, phase, role }) => {
-      pen.strokeStyle = kind === REPORTED ? look.fault : look.robot[role];
+    draw(({ path, phase, role }, strength = 1) => {
+      const hue = kind === REPORTED ? look.fault : look.robot[role];
+      pen.strokeStyle = strength < 1 ? `color-mix(in srgb, ${hue} ${Math.round(100 * strength)}%, ${look.paper})` : hue;
       const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
       this.plane.marks.add(kind === REPORTED ? "reported" : `path-${phase}`);
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
@@ -123,7 +128,7 @@ export class Trails {
 
   /** Returns the trail from tick `from` to `to` in pieces { path, phase, role } of one style; cached once it is complete. */
   #pieces(store, robot, kind, from, to, whole) {
-    const key = `${kind.name}/${robot.id}/${from}`, cached = this.#chunks.get(key);
+    const key = `${kind.name}/${robot.id}/${from}/${to - from}`, cached = this.#chunks.get(key);
     if (cached && whole) return cached;
     const pieces = [], period = store.stage.mission.period;
     let path = null, phase = null, role = null, complete = true;
