@@ -58,12 +58,16 @@ def test_the_other_pages_break_no_rule(opened: Open, tmp_path: Path) -> None:
         ("estimate", SAMPLE, "--noise", "uwb-calibrated", "--out", tmp_path / "estimated"),
     ):
         assert tandem(*command).status == 0
-    for folder, ready in ((".", "#list a"), ("swept", ".cell"), ("estimated", "#sweep table")):
+    for folder, ready in ((".", "#list a"), ("swept", ".cell"), ("estimated", "#home")):
         with watching(tmp_path / folder) as (_, where):
             for dark in (False, True):
                 page = opened(where, dark=dark)
                 expect(page.locator(ready).first).to_be_visible()
                 assert not violations(page), (folder, dark)
+                if folder == "estimated":
+                    page.locator("#home").click()
+                    expect(page.locator("#sweep table")).to_be_visible()
+                    assert not violations(page), (folder, dark)
 
 
 @chromium_only

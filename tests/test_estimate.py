@@ -45,8 +45,11 @@ from compose.recording.ranging.range_recording import (
     TruePath,
 )
 from compose.recording.ranging.range_steps import dead_reckoned, relative
+from compose.view.epochs import write_player
+from compose.view.estimated import read_player
+from compose.view.recorded import scenes as recorded_scenes
 from docs import recorded_claims
-from protocol.motion import Pose, step
+from protocol.motion import Pose, step, travelled
 from protocol.noise import Noise, ProfileName, VelocityNoise
 from tests.commands import tandem
 
@@ -544,6 +547,33 @@ def test_a_folder_that_cannot_be_written_is_refused_before_the_estimate(
     words = [str(SAMPLE), "--window", "0..8", "--out", str(tmp_path / "file")]
     with pytest.raises(CannotWrite, match="file cannot be written: File exists"):
         estimate_command.main(parser.parse_all(words))
+
+
+def test_the_page_plays_an_estimate_as_a_run_in_which_claims_and_hypotheses_are_those_of_the_estimate(
+    sample: RangeRecording, of_sample: RecordingEstimate, tmp_path: Path
+) -> None:
+    problem = measurements(sample, ("A", "B"), "uwb-calibrated", None)
+    write_player(tmp_path, problem, of_sample)
+    found = read_player(tmp_path)
+    assert found is not None
+    known = found.run_data()
+    scenes = {one.tick: one for one in recorded_scenes(found.setup, known)}
+    for epoch in of_sample.epochs:
+        scene = scenes[round((epoch.t - problem.t0) / EPOCH_S)]
+        for row in epoch.rows:
+            player = scene.player(row.robot)
+            assert player.held is not None
+            assert player.command is not None
+            assert player.pose is not None
+            assert len(player.held.world) == len(epoch.hypotheses)
+            assert (player.held.world[0].x, player.held.world[0].y) == (row.x, row.y)
+            assert travelled(player.held.world[0], player.pose) == pytest.approx(row.position_error_m)
+            assert (player.command.verdict is not None) == row.claim
+    texts = [caption.text for scene in scenes.values() for caption in scene.captions]
+    assert "Both claim to know their poses." in texts
+    assert texts[-1] == "Both are localised: each knows its position and its heading."
+    ranged = sum([len(player.anchors) for scene in scenes.values() for player in scene.players])
+    assert ranged == of_sample.summary.ranges["A-LC0"] + of_sample.summary.ranges["B-LC1"]
 
 
 def test_the_command_writes_a_table_a_summary_and_figures(tmp_path: Path) -> None:

@@ -6,6 +6,8 @@ import json
 import re
 from pathlib import Path
 
+import pyarrow as pa
+import pyarrow.parquet as pq
 import pytest
 from playwright.sync_api import Route, expect
 
@@ -32,6 +34,10 @@ ROWS = (
 )
 
 
+SCRUB_TO = "(slider, step) => { slider.value = step; slider.dispatchEvent(new Event('input')); }"
+"""Moves a slider, as a user does who drags it."""
+
+
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
     """Return a folder that has what the page reads of a sweep."""
@@ -55,6 +61,21 @@ def test_the_map_has_each_cell_in_its_place_with_its_outcomes_in_words(opened: O
         expect(page.get_by_role("button", name="25 % of 4 localised, 2 wrong, 1 undecided")).to_have_count(1)
         expect(page.locator(".facts dd").first).to_have_text("66.7 % of 12")
         shot(page, "sweep-map")
+
+
+def test_the_slider_shows_how_many_trials_have_localised_by_a_tick(opened: Open, folder: Path) -> None:
+    outcomes = ["localised", "localised", "undecided", "localised", "wrong"]
+    trials = {"cell": [0, 0, 0, 1, 2], "ticks": [10, 30, 5, 20, 8], "outcome": outcomes}
+    pq.write_table(pa.table(trials), folder / "trials.parquet")
+    with watching(folder) as (_, where):
+        page = opened(where)
+        shares, slider = page.locator(".cell b"), page.get_by_role("slider", name="Tick")
+        expect(shares).to_have_text(["50 %", "25 %", "0 %"])
+        slider.evaluate(SCRUB_TO, "12")
+        expect(page.locator(".heat output")).to_have_text("by tick 12")
+        expect(shares).to_have_text(["25 %", "0 %", "0 %"])
+        slider.evaluate(SCRUB_TO, "20")
+        expect(shares).to_have_text(["25 %", "25 %", "0 %"])
 
 
 @pytest.mark.long

@@ -340,6 +340,10 @@ def test_an_estimate_shows_its_robots_and_its_figures(opened: Open, tmp_path: Pa
     with watching(folder) as (_, where):
         page = opened(where)
         expect(page.locator("#title")).to_have_text("tiers-a-b-30-s.pyfg")
+        expect(page.locator("#status")).to_contain_text("after 23 ticks")
+        scrub_to(page, 12)
+        expect(page.locator("#robots")).to_contain_text("hypotheses")
+        page.get_by_role("link", name="Table and figures").click()
         expect(page.locator("#status")).to_have_text("estimate")
         expect(page.locator("#sweep tbody tr")).to_have_count(2)
         expect(page.locator("#sweep tbody tr").first).to_contain_text("LC0")

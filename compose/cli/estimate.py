@@ -26,6 +26,7 @@ from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
 from compose.terminal.tables import shown
 from compose.terminal.text_width import tell
+from compose.view.epochs import write_player
 from protocol.output import discard, say
 
 
@@ -108,6 +109,7 @@ def _written(out: Path, problem: Measurements, estimate: RecordingEstimate) -> l
     """Write all files into `out`, figures if there is Matplotlib; return their paths. Raises UserError."""
     with writing(out):
         paths = write_estimate(out, estimate.rows, estimate.summary)
+        paths.append(write_player(out, problem, estimate))
         if find_spec("matplotlib") is None:
             say("tandem estimate: no figures: they need matplotlib (extra lab)", error=True)
             return paths

@@ -92,6 +92,8 @@ class PresentMeeting(NamedTuple):
     """The role of the robot in it."""
 
 
+ESTIMATED = "estimate"
+"""The mode of an estimate from recorded ranges, which is no run."""
 Meetings = Mapping[RobotId, PresentMeeting]
 """The latest meeting of each robot of which one is known."""
 
@@ -120,7 +122,7 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
     """The tick limit of the mission. None, like all fields below, without the world's journal."""
     seed: int | None = None
     mode: str | None = None
-    """The launch mode, "processes" or "in-process"; None if unknown."""
+    """The launch mode, "processes" or "in-process", or ESTIMATED; None if unknown."""
     tick_s: float | None = None
     """The wall-clock duration of a tick in s; None in lockstep."""
     faults: tuple[Fault, ...] = ()

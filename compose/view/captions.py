@@ -13,7 +13,7 @@ from typing import Literal
 import msgspec
 
 from compose.recording.reasons import plain_reason
-from compose.recording.run_setup import RobotSetup, RunSetup
+from compose.recording.run_setup import ESTIMATED, RobotSetup, RunSetup
 from compose.view.deliveries import contact_of
 from compose.view.events import Event, metres
 from compose.view.pair_data import PairData
@@ -307,8 +307,8 @@ def team_beginning(team: PairData) -> Told:
     yield Caption("rules", text)
     shared = "" if number == 1 else f"{count_word(number).capitalize()} robots share all that they measure. "
     what = ["an anchor"] * bool(setup.anchors) + ["another robot"] * (number > 1)
-    reach = f"up to {setup.mission.sensing_range:g} m, but not in which direction."
-    text = f"{shared}A robot measures how far away {' or '.join(what)} is, {reach}"
+    reach = "" if setup.mode == ESTIMATED else f", up to {setup.mission.sensing_range:g} m"
+    text = f"{shared}A robot measures how far away {' or '.join(what)} is{reach}, but not in which direction."
     yield Caption("ranging", text, truth="The simulated sensors are exact." if team.exact else None)
 
 

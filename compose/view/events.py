@@ -9,7 +9,7 @@ from typing import Literal
 import msgspec
 
 from compose.recording.reasons import plain_reason
-from compose.recording.run_setup import RobotSetup, RunSetup
+from compose.recording.run_setup import ESTIMATED, RobotSetup, RunSetup
 from compose.view.deliveries import Passage, contact_of
 from compose.view.run_data import TickData
 from compose.view.words import doing
@@ -107,6 +107,8 @@ def _sensing(
 ) -> Iterator[Event]:
     robot, tick = robot_setup.id, now.tick
     observation = now.observations.get(robot)
+    if setup.mode == ESTIMATED:  # whoever was in range had no range in most epochs
+        return
     earlier = before.observations.get(robot) if before is not None else None
     if observation is None or (before is not None and earlier is None):
         return

@@ -49,6 +49,8 @@ OF_TEAMS = {
     "homing": "{robot} drives back to where it had a range",
     "searching": "{robot} searches for robots that have no range yet",
     "waiting": "{robot} waits until another robot finds it",
+    "unlocated": "no pose of {robot} is estimated",
+    "doubtful": "the pose of {robot} may not be claimed yet",
 }
 """Sentences by state name, of robots of a team."""
 WAITING = "{robot} waits beside its anchor until {peer} comes into range"

@@ -29,6 +29,8 @@ MOST_CHANGED = 8
 """The number of changed missions that a server stores. Of more, the oldest is deleted."""
 MOST_MISSION_TICKS = 20_000
 """The last tick of a changed mission."""
+MOST_STEPS = 200
+"""The maximum number of ticks at which the trials of a sweep are counted."""
 TRIAL_S, MISSION_S = 60.0, 8.0
 """The wall times in s after which a trial, and a changed mission, that has not ended is stopped."""
 LATE = f"the scenario has not been computed after {MISSION_S:g} s"
@@ -86,6 +88,7 @@ class Trials(Reruns):
         super().__init__(work)
         self._sweep = folder
         self._worst: dict[int, WorstTrial] = {}
+        self._over_time: Any = None
 
     def worst(self, cell: int) -> WorstTrial:
         """Return the worst trial of `cell`; the first call runs it. Raises UserError if that fails."""
@@ -96,6 +99,13 @@ class Trials(Reruns):
             self._worst[cell] = WorstTrial(show, *found)
             show.name = f"cell-{cell}-trial-{self._worst[cell].trial}"
         return self._worst[cell]
+
+    def over_time(self) -> Any:
+        """Return how many trials of each cell are localised by which ticks. Raises UserError."""
+        if self._over_time is None:
+            late = f"the trials are not read after {TRIAL_S:g} s"
+            self._over_time = self._work.result(over_time, str(self._sweep), within=TRIAL_S, late=late)
+        return self._over_time
 
     @property
     def shows(self) -> list[Recorded]:
@@ -214,3 +224,23 @@ def run_worst(folder: str, cell: int, out: str) -> tuple[str, int, int]:
     except (msgspec.MsgspecError, ValueError) as error:
         raise UserError(f"cell {cell} cannot be run: {error}") from None
     return note.outcome, note.trial, note.seed
+
+
+def over_time(folder: str) -> dict[str, Any]:
+    """Return the numbers of trials that are localised by certain ticks, by the cell. Raises UserError."""
+    import numpy as np  # noqa: PLC0415
+    import pyarrow.parquet as pq  # noqa: PLC0415  # optional, and slow to import
+
+    try:
+        table = BytesIO(files.read_inside(Path(folder), TRIALS, most=MOST_TABLE_BYTES))
+        found = pq.read_table(table, columns=["cell", "ticks"], filters=[("outcome", "=", "localised")])
+    except (OSError, ValueError) as error:
+        raise UserError(f"{folder}: {TRIALS} cannot be read: {error}") from None
+    cells, ticks = (np.asarray(found[name]) for name in ("cell", "ticks"))
+    last = int(ticks.max(initial=0))
+    steps = np.unique(np.linspace(0, last, min(last + 1, MOST_STEPS)).astype(int))
+    counts = {
+        str(cell): np.searchsorted(np.sort(ticks[cells == cell]), steps, side="right").tolist()
+        for cell in np.unique(cells).tolist()
+    }
+    return {"ticks": steps.tolist(), "localised": counts}

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib.util import find_spec
 from io import StringIO
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ import msgspec
 
 from compose.errors import UserError
 from compose.sweep import PARTS, SUMMARY_CSV, SWEEP_JSON
+from compose.view.web.reruns import TRIALS
 from protocol import documents, files
 
 ESTIMATE = "estimate.json"
@@ -49,6 +51,7 @@ def of_sweep(folder: Path) -> dict[str, Any]:
             "refused": manifest["refused"],
             "rows": rows,
             "under_way": (folder / PARTS).is_dir(),
+            "timed": bool(rows) and (folder / TRIALS).is_file() and find_spec("pyarrow") is not None,
             "figures": figures_of_sweep(folder),
         }
 

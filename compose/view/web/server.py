@@ -109,7 +109,7 @@ class _Answers:
 
     async def results(self, request: Request) -> Response:
         """Return the data of the sweep or of the estimate that the server shows."""
-        return _json(self._site.results(request.path_params["kind"]))
+        return _json(await self._computed(self._site.results, request.path_params["kind"]))
 
     async def figure(self, request: Request) -> Response:
         figure = self._site.figure(request.path_params["name"])

@@ -13,12 +13,13 @@ from compose.errors import UserError
 from compose.recording.comparison import comparison
 from compose.recording.recording_files import journals_in
 from compose.recording.run import read
+from compose.view.estimated import read_player
 from compose.view.web import results_page
 from compose.view.web.costs import costs
 from compose.view.web.live import Listener
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.reruns import ChangedMissions, Trials
-from compose.view.web.sources import Recorded, WatchedRun, end_of
+from compose.view.web.sources import Estimated, Recorded, WatchedRun, end_of
 from protocol import files
 from protocol.journal.journal_file import CorruptJournal
 
@@ -47,6 +48,8 @@ class Site:
         self.compared = compared
         self.folder = folder
         self.estimate = estimate
+        player = read_player(estimate) if estimate is not None else None
+        self.players = [Estimated(player)] if player is not None else []
         self.work = RequestedWork()
         self.trials = Trials(folder, self.work) if folder is not None else None
         self.changed = ChangedMissions(self.work)
@@ -58,7 +61,7 @@ class Site:
         """The runs whose static data is known, by name."""
         trials = self.trials.shows if self.trials is not None else []
         found: dict[str, WatchedRun] = {
-            show.name: show for show in [*self.recorded, *trials, *self.changed.shows]
+            show.name: show for show in [*self.recorded, *self.players, *trials, *self.changed.shows]
         }
         for i, listener in enumerate(self.listeners):
             for run, show in listener.shows.items():
@@ -85,9 +88,15 @@ class Site:
         return None
 
     def results(self, kind: str) -> dict[str, Any]:
-        """Return the data of the folder of kind `sweep` or `estimate`. Raises UserError without one."""
+        """Return the data of the folder of kind `sweep` or `estimate`. Raises UserError without one.
+
+        Of kind `ticks` are the numbers of trials of the sweep that are localised by which ticks.
+        """
         if kind == "sweep" and self.folder is not None:
             return results_page.of_sweep(self.folder)
+        if kind == "ticks" and self.trials is not None:
+            found: dict[str, Any] = self.trials.over_time()
+            return found
         if kind == "estimate" and self.estimate is not None:
             return results_page.of_estimate(self.estimate)
         raise UserError(f"this server shows no {kind}")

@@ -16,6 +16,7 @@ from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
 from compose.recording.summary_json import SUMMARY_JSON
+from compose.view.estimated import PlayedEstimate
 from compose.view.run_data import RunData
 from protocol import documents
 from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
@@ -239,6 +240,19 @@ class Recorded(WatchedRun):
     def concluded(self) -> None:
         """Mark the recording as complete, because its writers have ended."""
         self._expected = False
+
+
+class Estimated(WatchedRun):
+    """The estimate in a folder, as a run that has ended."""
+
+    live = False
+
+    def __init__(self, found: PlayedEstimate) -> None:
+        super().__init__("estimate", found.run_data())
+        self.setup = found.setup
+
+    def poll(self) -> None:
+        """Do nothing: the files do not change."""
 
 
 def writers_of(journals: Iterable[Path]) -> dict[str, int]:

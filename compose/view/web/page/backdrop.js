@@ -87,6 +87,7 @@ export class Backdrop {
   /** Draws the range of an anchor, and its robot's orbit or, in a team, three sigmas of its position. */
   #anchor(view, robot) {
     const { pen, plane } = this, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
+    if (view.store.estimated) return;
     pen.globalAlpha = alpha;
     pen.beginPath();
     pen.arc(x, y, reach, 0, TAU);
@@ -144,6 +145,6 @@ export class Backdrop {
   #place({ store, focus }, robot) {
     const reach = store.stage.mission.sensing_range * this.plane.scale;
     const mine = !focus || robot.id === focus || robot.peer === focus || robot.sigma !== undefined;
-    return { at: this.plane.at(robot.anchor), reach, radius: reach > 40 ? 6 : 4, alpha: mine ? 1 : 0.45 };
+    return { at: this.plane.at(robot.anchor), reach: store.estimated ? LEGIBLE + 1 : reach, radius: reach > 40 ? 6 : 4, alpha: mine ? 1 : 0.45 };
   }
 }

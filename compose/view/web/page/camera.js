@@ -19,7 +19,7 @@ export function scenario_discs(robots, store) {
   if (team) {
     const known = anchors.map((one) => store.anchor_at(one, true)).filter(Boolean);
     const starts = known.length ? [] : store.stage.robots.map(({ id }) => store.player(store.first, id)?.pose).filter(Boolean);
-    const discs = [...known, ...starts].map((at) => [at, (known.length ? 1 : 0.6) * sensing_range]);
+    const discs = [...known, ...starts].map((at) => [at, (store.estimated ? 0.3 : known.length ? 1 : 0.6) * sensing_range]);
     return discs.length ? discs : [[[0, 0], sensing_range * Math.sqrt(store.stage.robots.length)]];
   }
   const anchored = robots.filter(({ anchor }) => anchor), discs = anchored.map(({ anchor, orbit }) => [anchor, Math.max(sensing_range, orbit[0])]);

@@ -2,6 +2,7 @@
 
 import { make } from "./cards.js";
 
+const STEP_MS = 60; // between two ticks while time passes
 const OUTCOMES = ["wrong", "inconsistent", "failed", "undecided"];
 
 /** Returns the maps of `rows`, whose cells are buttons that call `on_cell` with the row and the button. */
@@ -13,6 +14,34 @@ export function heat_map(axes, rows, on_cell) {
     make("h2", { textContent: "Share of trials that localised" }),
     make("p", { className: "note", textContent: "Select a cell to play its worst trial." }),
     ...maps);
+}
+
+/** Adds a slider of ticks to the maps: each cell then has the share of its trials that have localised by that tick. */
+export function add_time(maps, { ticks, localised }) {
+  const last = ticks.length - 1, slider = make("input", { type: "range", min: 0, max: last, value: last, ariaLabel: "Tick" });
+  const play = make("button", { type: "button", textContent: "Play" }), at = make("output", {});
+  let timer = null;
+  const draw = () => {
+    const step = Number(slider.value);
+    at.textContent = `by tick ${ticks[step]}`;
+    slider.setAttribute("aria-valuetext", at.textContent);
+    for (const cell of maps.querySelectorAll(".cell")) {
+      const share = (localised[cell.dataset.cell]?.[step] ?? 0) / cell.dataset.trials;
+      cell.style.setProperty("--share", share);
+      cell.firstChild.textContent = `${Math.round(100 * share)} %`;
+      cell.lastChild.hidden = step < last; // the outcomes at the end
+    }
+  };
+  const stop = () => { clearInterval(timer); timer = null; play.textContent = "Play"; };
+  play.addEventListener("click", () => {
+    if (timer !== null) return void stop();
+    if (Number(slider.value) === last) slider.value = 0;
+    play.textContent = "Pause";
+    timer = setInterval(() => { slider.value = Number(slider.value) + 1; draw(); if (Number(slider.value) >= last) stop(); }, STEP_MS);
+  });
+  slider.addEventListener("input", () => { stop(); draw(); });
+  maps.querySelector("h2").after(make("div", { className: "line" }, play, slider, at));
+  draw();
 }
 
 function map(down, across, rest, chosen, axes, by_cell, on_cell) {
@@ -37,6 +66,7 @@ function cell(row, axes, caption, on_cell) {
   const button = make("button", { type: "button", className: "cell" }, make("b", { textContent: percent }),
     make("span", { textContent: bad.map((outcome) => `${row[outcome]} ${outcome}`).join(", ") }));
   button.style.setProperty("--share", row.rate);
+  Object.assign(button.dataset, { cell: row.cell, trials: row.trials });
   if (Number(row.wrong) || Number(row.violations)) button.classList.add("bad");
   const where = [caption, ...axes.filter(([axis]) => axis).map(([axis, label]) => `${title(axis)} ${label}`)].filter(Boolean).join(", ");
   const counts = bad.map((outcome) => `, ${row[outcome]} ${outcome}`).join("");

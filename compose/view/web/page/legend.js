@@ -22,7 +22,7 @@ const LASTING = {
   localised: [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), ({ team }) => `localised robot, its path${team ? "" : " and its anchor"}`],
   unlocalised: [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), "robot that is not yet localised, its path"],
   meeting: [drawn('<path d="M1 8h20" stroke="var(--robot-a)" stroke-width="1.3"/><path d="M28 8l-7 3v-6z" fill="var(--robot-a)"/>'), "who localises whom; dotted: planned"],
-  anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor (beacon); range ${range}`],
+  anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor (beacon)${range && `; range ${range}`}`],
   unsurveyed: [drawn('<path d="M15 4.5l3.5 6h-7z" fill="var(--paper)" stroke="var(--ink)"/>'), "anchor at a position that robots do not know"],
   orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="6 4"/>'), ({ own }) => (own ? "orbit" : "search circle (phase 2)")],
   "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), ({ own, team }) => (team ? "path, not located" : `path, phase 1${own ? "" : ": near anchor"}`)],

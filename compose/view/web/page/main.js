@@ -26,6 +26,7 @@ import { Timeline } from "./timeline.js";
 import { joined } from "./tints.js";
 import { plural, seconds } from "./words.js";
 
+const RESULTS = "#results"; // the address of the table and the figures of an estimate
 const SETTLED_MS = 200; // after the last movement of the camera
 
 const $ = (id) => document.getElementById(id);
@@ -112,10 +113,11 @@ async function on_list(list) {
   const alone = listed?.shows.length === 1;
   listed = list;
   if (alone && list.shows.length > 1) update_address(); // it has not named the only mission
-  if (list.estimate) {
+  if (list.estimate && (location.hash === RESULTS || !list.shows.length)) {
     if (!$("sweep").hidden) return;
     text($("title"), await estimate($("sweep")));
     document.title = `${$("title").textContent} · Tandem`;
+    if (list.shows.length) Object.assign($("home"), { hidden: false, textContent: "Play" });
     return void text($("status"), "estimate");
   }
   if (list.sweep && !address_state().show) {
@@ -168,6 +170,8 @@ async function open(name) {
 function staged() {
   $("home").hidden = !listed || (listed.shows.length < 2 && !listed.sweep);
   if (listed?.sweep) $("home").textContent = "The sweep";
+  if (listed?.estimate) Object.assign($("home"), { hidden: false, textContent: "Table and figures", href: RESULTS });
+  document.body.classList.toggle("estimated", store.estimated);
   for (const id of ["mission", "time", "view"]) $(id).hidden = false;
   for (const id of ["list", "sweep"]) $(id).hidden = true;
   $("title").textContent = store.stage.name;
@@ -330,7 +334,7 @@ function legend_names() {
   const story = guide.pair(view.focus), several = store.stage.robots.length > story.length;
   const of = (role) => (several ? null : story.find((robot) => robot.role === role)?.id) ?? `of role ${role}`;
   const at = view.eliminated < 1 ? view.tick - 1 : view.tick, manoeuvre = joined(store.scene(at), story[0].id)?.manoeuvre;
-  const range = `${Number(store.stage.mission.sensing_range.toFixed(3))}\u00a0m`, own = store.stage.robots.some(({ own_planner }) => own_planner);
+  const range = store.estimated ? "" : `${Number(store.stage.mission.sensing_range.toFixed(3))}\u00a0m`, own = store.stage.robots.some(({ own_planner }) => own_planner);
   return { a: of("a"), b: of("b"), mover: manoeuvre?.robot ?? "a robot", range, own, team: store.stage.team };
 }
 
@@ -429,7 +433,7 @@ function change(on = !changes.open) {
 }
 
 /** True if the scenario can be changed and run again. */
-const changeable = () => data.served && !embedded && !store.live;
+const changeable = () => data.served && !embedded && !store.live && !listed?.estimate;
 
 function fit() {
   plane.fit(store, view.focus, view.truth);
@@ -487,6 +491,7 @@ fill_help($("key-list"), $("signs"));
 
 window.addEventListener("hashchange", () => {
   const { show, tick, robot, selected, view: look, truth } = address_state();
+  if (listed?.estimate && (location.hash === RESULTS) === Boolean(store)) return void location.reload();
   if (!store || (show || store.name) !== store.name || (!show && (listed?.sweep || listed?.shows.length > 1))) return void (listed && on_list(listed));
   view.focus = store.places.has(robot) ? robot : null;
   view.selected = selected;

@@ -113,7 +113,7 @@ export class Signals {
   /** Draws how far `robot`, which is at `place`, can range `peer`, in the tick in which they come in range. */
   #reach({ store, tick, share, moving, look }, robot, peer, place) {
     const alpha = fading(share, moving), earlier = store.player(tick - 1, robot.id);
-    if (!earlier || earlier.contacts?.some(([id]) => id === peer) || alpha <= 0) return;
+    if (store.estimated || !earlier || earlier.contacts?.some(([id]) => id === peer) || alpha <= 0) return;
     const pen = this.plane.context, before = pen.globalAlpha, radius = store.stage.mission.sensing_range * this.plane.scale;
     this.plane.marks.add("reach");
     pen.globalAlpha = 0.6 * alpha * before;

@@ -46,6 +46,9 @@ export class Store {
   /** True if the robots form no pairs: they are a group, which meets in turn, or a team. */
   get grouped() { return this.stage.visits?.length > 0 || this.stage.team; }
 
+  /** True for an estimate from recorded ranges: nobody knows how far radios reach, or what robots were told. */
+  get estimated() { return this.stage.mode === "estimate"; }
+
   /** Returns where an anchor of a team is drawn: with the `truth` where it is, else where robots know it; null if nowhere. */
   anchor_at({ position, place }, truth) { return (truth ? place : null) ?? position; }
 

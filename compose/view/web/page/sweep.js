@@ -1,7 +1,7 @@
 // The page of a sweep: its figures, a map of its cells, and a table. A cell plays its worst trial, which the server runs again.
 
 import { make } from "./cards.js";
-import { heat_map } from "./heat.js";
+import { add_time, heat_map } from "./heat.js";
 import { style } from "./thumbnail.js";
 
 export async function sweep(root) {
@@ -12,7 +12,7 @@ export async function sweep(root) {
     root.replaceChildren(make("p", { textContent: result.error }));
     return "Sweep";
   }
-  const { name, rows, axes, trials, seed, refused, under_way, folder, figures } = result;
+  const { name, rows, axes, trials, seed, refused, under_way, timed, folder, figures } = result;
   const sum = (field) => rows.reduce((total, row) => total + Number(row[field] || 0), 0);
   const facts = [
     ["localised", share(sum("localised"), sum("trials"))], ["wrong", sum("wrong")], ["inconsistent", sum("inconsistent")],
@@ -27,6 +27,7 @@ export async function sweep(root) {
   const said = make("p", { id: "trial", className: "note" });
   said.setAttribute("role", "status");
   if (rows.length) root.append(heat_map(axes, rows, (row, button) => play(row, button, said)), said);
+  if (timed) fetch("/api/results/ticks").then(async (found) => { if (found.ok) add_time(root.querySelector(".heat"), await found.json()); });
   root.append(make("div", { className: "figures" }, ...figures.map((figure) => make("figure", {},
     make("img", { src: `/api/figures/${encodeURIComponent(figure)}`, alt: figure.replace(".svg", "").replaceAll("-", " "), loading: "lazy" })))));
   if (rows.length) root.append(table(rows, axes));

@@ -1,0 +1,63 @@
+"""An estimate from a range recording as the page plays it: a run of robots that share all measurements.
+
+A tick is an epoch of the estimate. Its messages are those that such robots would send; their commands say
+which poses may be claimed, and no more: nobody knows what the robots were told.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from compose.errors import UserError
+from compose.recording.run_setup import RunSetup
+from compose.view.run_data import RunData
+from protocol import documents, files
+from protocol.messages import Command, Estimate, MissionEnd, Observation
+from protocol.motion import Pose
+
+PLAYER_JSON = "player.json"
+"""The file in the folder of an estimate."""
+
+
+class Epoch(msgspec.Struct, frozen=True):
+    """One epoch."""
+
+    tick: int
+    truth: dict[str, Pose]
+    """The true poses of the robots of which they are known."""
+    observations: list[Observation]
+    commands: list[Command]
+    estimates: list[Estimate]
+
+
+class PlayedEstimate(msgspec.Struct, frozen=True):
+    """The content of the file."""
+
+    setup: RunSetup
+    epochs: list[Epoch]
+    end: MissionEnd
+
+    def run_data(self) -> RunData:
+        """Return the data of all epochs."""
+        known = RunData()
+        for one in self.epochs:
+            known.at(one.tick).truth.update(one.truth)
+            known.has_truth = known.has_truth or bool(one.truth)
+            for message in (*one.observations, *one.commands, *one.estimates):
+                known.add(message, 0)
+        known.conclude(self.end)
+        return known
+
+
+def read_player(folder: Path) -> PlayedEstimate | None:
+    """Return the content of the file in `folder`; None without one. Raises UserError if it cannot be read."""
+    try:
+        content = files.read_inside(folder, PLAYER_JSON, most=documents.MOST_DOCUMENT_BYTES)
+        found: PlayedEstimate = documents.json_value(content, PlayedEstimate)
+    except FileNotFoundError:
+        return None
+    except (OSError, msgspec.MsgspecError, ValueError) as error:
+        raise UserError(f"{folder / PLAYER_JSON} cannot be read: {documents.flaw(error)}") from None
+    return found
