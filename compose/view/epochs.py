@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections import defaultdict
+from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from compose.recording.estimating.estimate_rows import FinalHypothesis, PoseEstimateRow
 from compose.recording.estimating.estimate_run import RecordingEstimate
 from compose.recording.estimating.recorded_measurements import EPOCH_S, Measurements
 from compose.recording.estimating.true_poses import true_pose
@@ -30,93 +33,75 @@ from protocol.noise import Noise
 
 
 def played(problem: Measurements, estimate: RecordingEstimate) -> PlayedEstimate:
-    """Return an estimate as a run."""
-    ids, ranges = [one.id for one in problem.robots], problem.joint.ranges
-    anchors = {one.id: one for one in problem.anchors}
-    setup = RunSetup(
-        problem.source.rpartition("/")[2],
-        tuple([RobotSetup(robot) for robot in ids]),
-        Mission(
-            max(float(np.max(ranges.rho, initial=0.0)), 1e-3), EPOCH_S, 1.0, math.pi,
-            noise=Noise(anchor_sigma=float(np.median(ranges.sigma)) if len(ranges.sigma) else 1.0),
-        ),
-        "assured",
-        max((one.t - problem.t0 for one in estimate.epochs), default=0.0),
-        mode=ESTIMATED,
-        team=True,
-        anchors=tuple(
-            [
-                AnchorSetup(name, Anchor(one.x, one.y) if math.isfinite(one.x) else None, min(one.sigma, 1e3))
-                for name, one in anchors.items()
-            ]
-        ),
-        origin=problem.relative_to,
-    )  # fmt: skip
-    epochs = [_epoch(problem, 0, [], {}, {}, problem.t0)]
+    """Return an estimate as a run, whose sensing range is the longest range that was measured."""
+    epochs = [_epoch(problem, 0, problem.t0, (), ())]
     for one in estimate.epochs:
         tick = max(round((one.t - problem.t0) / EPOCH_S), epochs[-1].tick + 1)
-        held = {row.robot: row for row in one.rows}
-        poses = {
-            robot: [(each.probability, Pose(*each.poses[robot])) for each in one.hypotheses] for robot in held
-        }
-        covariances = {
-            row.robot: Covariance(row.xx, row.xy, row.xh, row.yy, row.yh, row.hh) for row in one.rows
-        }
-        claims = [row.robot for row in one.rows if row.claim]
-        epochs.append(_epoch(problem, tick, claims, poses, covariances, one.t))
-    localised = len(estimate.epochs) > 0 and all(estimate.epochs[-1].claims)
-    why = () if localised else (Cause("failed", text=estimate.summary.blocking_reason or None),)
-    return PlayedEstimate(
-        setup, epochs, MissionEnd(epochs[-1].tick, "localised" if localised else "undecided", why)
+        epochs.append(_epoch(problem, tick, one.t, one.rows, one.hypotheses))
+    ranges, last, why = problem.joint.ranges, epochs[-1].tick, estimate.summary.blocking_reason
+    sigma, longest = (float(np.max(one, initial=1e-3)) for one in (ranges.sigma, ranges.rho))
+    localised = bool(estimate.epochs) and all(estimate.epochs[-1].claims)
+    anchors = [
+        AnchorSetup(one.id, Anchor(one.x, one.y) if math.isfinite(one.x) else None, min(one.sigma, longest))
+        for one in problem.anchors
+    ]
+    setup = RunSetup(
+        problem.source.rpartition("/")[2],
+        tuple([RobotSetup(one.id) for one in problem.robots]),
+        Mission(longest, EPOCH_S, 1.0, math.pi, noise=Noise(anchor_sigma=sigma)),
+        planner_name="assured",
+        t_max_s=last * EPOCH_S,
+        mode=ESTIMATED,
+        team=True,
+        anchors=tuple(anchors),
+        origin=problem.relative_to,
     )
+    end = MissionEnd(last, "undecided", (Cause("failed", text=why or "a robot has no claim"),))
+    return PlayedEstimate(setup, epochs, MissionEnd(last, "localised") if localised else end)
 
 
 def _epoch(
     problem: Measurements,
     tick: int,
-    claims: list[str],
-    poses: dict[str, list[tuple[float, Pose]]],
-    covariances: dict[str, Covariance],
     t: float,
+    rows: Sequence[PoseEstimateRow],
+    hypotheses: Sequence[FinalHypothesis],
 ) -> Epoch:
-    """Return an epoch that ends at `t` s, with the hypotheses of each robot, the most probable first."""
-    joint, per = problem.joint, problem.ticks_per_epoch
-    inside = (
-        (joint.ranges.tick > (tick - 1) * per) & (joint.ranges.tick <= tick * per) & (joint.ranges.radio >= 0)
-    )
-    latest = {
-        joint.radios[int(joint.ranges.radio[i])]: float(joint.ranges.rho[i]) for i in np.flatnonzero(inside)
-    }
-    observations, commands, estimates = [], [], []
+    """Return an epoch that ends at `t` s: what each robot has measured in it, and holds at its end."""
+    ids, held = [one.id for one in problem.robots], {row.robot: row for row in rows}
+    epoch = Epoch(tick, {}, [])
+    contacts: dict[str, dict[str, Contact]] = defaultdict(dict)
+    anchors: dict[str, dict[str, NamedRange]] = defaultdict(dict)
+    ranges, per = problem.joint.ranges, problem.ticks_per_epoch
+    inside = (ranges.tick > (tick - 1) * per) & (ranges.tick <= tick * per) & (ranges.radio >= 0)
+    for i in np.flatnonzero(inside):
+        first, second = problem.joint.radios[int(ranges.radio[i])]
+        for robot, other in ((first, second), (second, first)):
+            if robot in ids and other in ids:
+                contacts[robot][other] = Contact(other, float(ranges.rho[i]), None)
+            elif robot in ids:
+                anchors[robot][other] = NamedRange(other, float(ranges.rho[i]))
     for one in problem.robots:
-        robot, anchors, contacts = one.id, [], []
-        for (first, second), rho in latest.items():
-            if robot in (first, second):
-                other = second if robot == first else first
-                if any(each.id == other for each in problem.robots):
-                    contacts.append(Contact(other, rho, None))
-                else:
-                    anchors.append(NamedRange(other, rho))
-        observations.append(
-            Observation(tick, robot, _driven(problem, robot, tick), None, tuple(contacts), (), tuple(anchors))
+        robot, row = one.id, held.get(one.id)
+        measured = (*contacts[robot].values(),), (), (*anchors[robot].values(),)
+        poses = tuple([Pose(*each.poses[robot]) for each in hypotheses] if row is not None else [])
+        covariance, verdict, state = None, None, "unlocated"
+        if row is not None:
+            covariance, state = Covariance(row.xx, row.xy, row.xh, row.yy, row.yh, row.hh), "doubtful"
+            if row.claim:
+                verdict, state = Localised(poses[0], covariance), "localised"
+        total = sum([each.probability for each in hypotheses])
+        shares = tuple([min(each.probability / total, 1.0) for each in hypotheses] if poses else [])
+        epoch.messages.extend(
+            [
+                Observation(tick, robot, _driven(problem, robot, tick), None, *measured),
+                Command(tick, robot, 0.0, 0.0, 3 if poses else 1, state, verdict),
+                Estimate(tick, robot, (), poses, verdict is not None, shares, covariance),
+            ]
         )
-        held, claimed = poses.get(robot, []), robot in claims
-        total = sum([probability for probability, _ in held]) or 1.0
-        verdict = Localised(held[0][1], covariances[robot]) if claimed else None
-        state = "localised" if claimed else "doubtful" if held else "unlocated"
-        commands.append(Command(tick, robot, 0.0, 0.0, 3 if held else 1, state, verdict))
-        estimates.append(
-            Estimate(
-                tick, robot, (), tuple([pose for _, pose in held]), claimed,
-                tuple([min(probability / total, 1.0) for probability, _ in held]), covariances.get(robot),
-            )
-        )  # fmt: skip
-    truth = {
-        one.id: Pose(*true.tolist())
-        for one in problem.robots
-        if (true := true_pose(one.recorded, t)) is not None
-    }
-    return Epoch(tick, truth, observations, commands, estimates)
+        if (true := true_pose(one.recorded, t)) is not None:
+            epoch.truth[robot] = Pose(*true.tolist())
+    return epoch
 
 
 def _driven(problem: Measurements, robot: str, tick: int) -> Controls | None:
@@ -126,8 +111,7 @@ def _driven(problem: Measurements, robot: str, tick: int) -> Controls | None:
     if not 0 <= before < now:
         return None
     distance = float(np.sum(path.v[before:now])) * problem.joint.period
-    turned = float(path.heading[now] - path.heading[before])
-    return Controls(distance / EPOCH_S, turned / EPOCH_S)
+    return Controls(distance / EPOCH_S, float(path.heading[now] - path.heading[before]) / EPOCH_S)
 
 
 def write_player(folder: Path, problem: Measurements, estimate: RecordingEstimate) -> Path:

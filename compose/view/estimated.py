@@ -22,14 +22,11 @@ PLAYER_JSON = "player.json"
 
 
 class Epoch(msgspec.Struct, frozen=True):
-    """One epoch."""
+    """One epoch: the true poses that are known, and the messages of all robots."""
 
     tick: int
     truth: dict[str, Pose]
-    """The true poses of the robots of which they are known."""
-    observations: list[Observation]
-    commands: list[Command]
-    estimates: list[Estimate]
+    messages: list[Observation | Command | Estimate]
 
 
 class PlayedEstimate(msgspec.Struct, frozen=True):
@@ -45,7 +42,7 @@ class PlayedEstimate(msgspec.Struct, frozen=True):
         for one in self.epochs:
             known.at(one.tick).truth.update(one.truth)
             known.has_truth = known.has_truth or bool(one.truth)
-            for message in (*one.observations, *one.commands, *one.estimates):
+            for message in one.messages:
                 known.add(message, 0)
         known.conclude(self.end)
         return known

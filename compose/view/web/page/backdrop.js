@@ -17,8 +17,8 @@ export class Backdrop {
 
   #key = "";
 
-  /** Copies the backdrop to the plane, and adds its labels and targets; draws it again if something in it has changed. */
-  draw(view, robots, ratio) {
+  /** Copies the backdrop to the plane, and adds the labels and targets of the robots that are `near`; draws it again if something in it has changed. */
+  draw(view, robots, near, ratio) {
     const { plane, canvas } = this, { store, tick, focus, truth, look } = view, { width, height } = plane.canvas;
     const known = [store.name, store.revision, store.last, Math.min(store.whole, tick + 1), Boolean(view.scene), robots.length];
     const key = [...known, tick, focus, truth, plane.centre, plane.scale, width, height, ratio, look.paper].join();
@@ -40,7 +40,7 @@ export class Backdrop {
     plane.context.drawImage(canvas, 0, 0);
     plane.context.restore();
     plane.labels.placed.push(this.bar);
-    for (const robot of robots) if (robot.anchor) this.#name(view, robot, `anchor of ${robot.id}`);
+    for (const robot of near) if (robot.anchor) this.#name(view, robot, `anchor of ${robot.id}`);
     for (const one of this.#shared(view)) this.#name(view, one, one.told ? one.id : `${one.id}, unknown`);
     const { anchors } = store.stage, marks = anchors.some(({ position }) => !position) && truth ? ["unsurveyed"] : [];
     if (!store.stage.team) marks.push("anchor", "orbit");

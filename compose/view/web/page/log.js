@@ -3,7 +3,7 @@
 import { make } from "./cards.js";
 import { KIND_NAMES, SIGNS, said } from "./words.js";
 
-const NEAR = 120;
+const NEAR = 60;
 
 export class Log {
   constructor(root, states, radio, go) {

@@ -310,8 +310,8 @@ function draw() {
     caption(guide.text(view));
     predictions.draw(view, store, guide.pair(view.focus));
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), (view.playing || plane.easing) && !still.matches ? now : null);
-    document.body.dataset.tick = view.tick;
-    document.body.dataset.shown = store.scene(view.tick) ? view.tick : "";
+    attribute(document.body, "data-tick", String(view.tick));
+    attribute(document.body, "data-shown", store.scene(view.tick) ? String(view.tick) : "");
     tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
     plane.draw(store, view);
     const size = [$("canvas").clientWidth, $("canvas").clientHeight];
@@ -341,20 +341,21 @@ function legend_names() {
 function controls() {
   const lost = document.body.classList.contains("lost");
   text($("status"), lost ? "connection to the server lost" : state_of(store.live, store.last, store.end));
-  $("status").dataset.outcome = lost ? "lost" : store.end?.outcome ?? (store.live ? "live" : "torn");
-  $("status").title = store.end?.reason ?? "";
+  const outcome = lost ? "lost" : store.end?.outcome ?? (store.live ? "live" : "torn");
+  attribute($("status"), "data-outcome", outcome);
+  attribute($("status"), "title", store.end?.reason ?? "");
   text($("tick"), `tick ${view.tick} of ${Math.max(store.last, 0)}`);
-  $("tick").dataset.time = seconds(view.tick * store.stage.mission.period);
+  attribute($("tick"), "data-time", seconds(view.tick * store.stage.mission.period));
   $("play").classList.toggle("on", view.playing);
-  $("play").setAttribute("aria-label", view.playing ? "Pause" : "Play");
+  attribute($("play"), "aria-label", view.playing ? "Pause" : "Play");
   $("play").classList.toggle("invite", view.guided && !view.playing && !store.live && view.tick === store.first);
-  $("guide").setAttribute("aria-pressed", String(view.guided));
-  $("caption").setAttribute("aria-live", view.guided && view.playing ? "polite" : "off");
-  $("camera").setAttribute("aria-pressed", String(plane.following));
+  attribute($("guide"), "aria-pressed", String(view.guided));
+  attribute($("caption"), "aria-live", view.guided && view.playing ? "polite" : "off");
+  attribute($("camera"), "aria-pressed", String(plane.following));
   $("follow").hidden = !store.live;
   $("change").hidden = !changeable();
-  $("change").setAttribute("aria-expanded", String(changes.open));
-  $("follow").setAttribute("aria-pressed", String(view.follow));
+  attribute($("change"), "aria-expanded", String(changes.open));
+  attribute($("follow"), "aria-pressed", String(view.follow));
   $("truth").checked = view.truth;
   $("truth").disabled = !store.has_truth;
   if ($("robot").value !== (view.focus ?? "")) $("robot").value = view.focus ?? "";
@@ -367,7 +368,7 @@ function controls() {
   const only = store.has_truth ? `only the belief of ${subject}` : `no ground truth: only the belief of ${subject}`;
   const unknown = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the ground truth of this tick is unknown" : "";
   text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the belief of ${subject}` : ""));
-  $("canvas").setAttribute("aria-label", described(store, view));
+  attribute($("canvas"), "aria-label", described(store, view));
 }
 
 function knows_bearing() {
@@ -383,6 +384,11 @@ function caption(content) {
   box.dataset.room = room;
   text(box, content);
   box.style.minHeight = `${box.offsetHeight}px`;
+}
+
+/** Sets an attribute only if it changes: else the browser computes styles again in each frame. */
+function attribute(element, name, value) {
+  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
 }
 
 function text(element, content) {

@@ -25,6 +25,8 @@ const CLEAR_PX = 12;
 /** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
 const DRAG_PX = 4;
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
+const VISIBLE_PX = 2; // the sensing range from which on poses and measurements can be told from the robots
+const ALL_DRAWN = 8; // robots that are all drawn, also those that are out of view
 const LEAST_PX = 40;
 /** The largest group whose robots always have their names. */
 const NAMED = 20;
@@ -243,9 +245,9 @@ export class Plane {
     const view = { store, tick, share, focus, truth, moving, eliminated, planned, turned, look, scene: store.scene(tick) };
     this.labels = new Labels(pen, look, this.width, this.height, this.#overlays());
     const shown = (robot) => truth || !focus || robot.id === focus;
-    const robots = store.stage.robots.filter(shown);
-    this.#backdrop.draw(view, robots, ratio);
-    for (const robot of robots) {
+    const all = store.stage.robots.filter(shown), robots = view.scene && all.length > ALL_DRAWN ? this.#in_view(view, all) : all;
+    this.#backdrop.draw(view, all, robots, ratio);
+    for (const robot of store.stage.mission.sensing_range * this.scale < VISIBLE_PX ? [] : robots) {
       if (!truth) this.#trails.believed_trail(view, robot);
       else for (const kind of kinds_of(robot)) this.#trails.newest(pen, view, robot, kind);
       if (truth) this.#trails.turned(pen, view, robot);
@@ -253,11 +255,25 @@ export class Plane {
     if (view.scene) this.#scene(view, robots);
     else this.#backdrop.beacons(view, robots);
     this.#ring(this.targets.find((one) => same(one, selected)), look);
-    this.canvas.style.cursor = this.hovered ? "pointer" : "";
+    const cursor = this.hovered ? "pointer" : "";
+    if (this.canvas.style.cursor !== cursor) this.canvas.style.cursor = cursor;
     this.labels.draw();
     this.handles?.draw(this, look, store.stage.robots);
     this.canvas.labels = this.labels.drawn;
     this.canvas.targets = this.targets;
+  }
+
+  /** Returns the robots of which something may be in view, with their peers: their anchors and poses are near it. */
+  #in_view({ store, scene }, robots) {
+    const { sensing_range } = store.stage.mission, [x, y] = this.centre;
+    const far = [this.width, this.height].map((size) => size / 2 / this.scale + 2 * sensing_range);
+    const near = ([px, py], more = 0) => Math.abs(px - x) < far[0] + more && Math.abs(py - y) < far[1] + more;
+    const found = new Set(robots.filter(({ id, anchor, orbit }) => {
+      const { pose, reported, held } = scene.players[store.places.get(id)];
+      const reach = anchor ? Math.max(orbit[0], ...(held?.local ?? []).map(([px, py]) => Math.hypot(px, py))) : 0;
+      return !(pose || held) || (anchor && near(anchor, reach)) || [pose, reported?.pose, ...(held?.world ?? [])].some((one) => one && near(one));
+    }).map(({ id }) => id));
+    return robots.filter(({ id, peer }) => found.has(id) || found.has(peer));
   }
 
   /** Draws a ring around the selected target. */
@@ -277,7 +293,12 @@ export class Plane {
   #scene(view, robots) {
     const { store, truth, focus } = view;
     view.size = this.robot_size(store);
-    view.places = new Map(store.stage.robots.map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
+    view.places = new Map((store.grouped ? store.stage.robots : robots).map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
+    if (store.stage.mission.sensing_range * this.scale < VISIBLE_PX) {
+      this.#backdrop.beacons(view, robots);
+      for (const robot of truth ? robots : []) this.#robot(view, robot, view.places.get(robot.id));
+      return;
+    }
     for (const robot of robots) if (!focus || robot.id === focus) this.#construction.mirror(view, robot);
     view.passed = new Map();
     for (const robot of robots.filter(({ role }) => role === "a")) {

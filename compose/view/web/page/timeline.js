@@ -49,6 +49,7 @@ export class Timeline {
     this.counts = new Map(store.stage.robots.map((robot) => [robot.id, []]));
     this.marks = [];
     this.counted = false;
+    this.#key = "";
   }
 
   /** Adds the scenes that have been loaded since the last call. */
@@ -75,6 +76,7 @@ export class Timeline {
   /** Discards the data of `tick` and later, because it has changed. */
   forget(tick) {
     if (tick >= this.read) return;
+    this.#key = "";
     for (const spans of [...this.spans.values(), ...this.contacts.values(), ...this.counts.values()]) {
       while (spans.length && spans.at(-1).from >= tick) spans.pop();
       if (spans.length) spans.at(-1).to = Math.min(spans.at(-1).to, tick - 1);
@@ -102,12 +104,38 @@ export class Timeline {
       canvas.width = Math.round(wide * ratio);
       canvas.height = Math.round(tall * ratio);
     }
-    const pen = canvas.getContext("2d");
+    const visible = canvas.getContext("2d"), now = Math.min(tick + (moving ? share : 0), this.last);
+    const key = [store.name, store.revision, this.read, this.last, focus, wide, tall, ratio, of("paper"), shown.map(({ id }) => id)].join();
+    if (key !== this.#key) this.#bands(this.#pen(ratio, wide, tall, of, shown), shown, band, wide, of, store);
+    this.#key = key;
+    visible.setTransform(1, 0, 0, 1, 0, 0);
+    visible.clearRect(0, 0, canvas.width, canvas.height);
+    visible.drawImage(this.#drawn, 0, 0);
+    visible.setTransform(ratio, 0, 0, ratio, 0, 0);
+    this.#hand(visible, this.#x(now, wide), tall, of);
+    this.#limit();
+    if (this.scrub.value !== String(tick)) this.scrub.value = String(tick);
+    const said = `tick ${tick} of ${this.last}. ${activities}`;
+    if (this.scrub.getAttribute("aria-valuetext") !== said) this.scrub.setAttribute("aria-valuetext", said);
+  }
+
+  #key = "";
+  #drawn = document.createElement("canvas");
+
+  #x(k, wide) { return this.inset + (k / Math.max(this.last, 1)) * (wide - this.inset - 6); }
+
+  /** Returns the pen of all but the hand, which stays the same while time passes. */
+  #pen(ratio, wide, tall, of, shown) {
+    Object.assign(this.#drawn, { width: this.canvas.width, height: this.canvas.height });
+    const pen = this.#drawn.getContext("2d");
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.clearRect(0, 0, wide, tall);
     pen.font = `11px ${of("font")}`;
     this.inset = 12 + Math.max(...shown.map((robot) => pen.measureText(robot.id).width));
-    const x = (k) => this.inset + (k / Math.max(this.last, 1)) * (wide - this.inset - 6);
+    return pen;
+  }
+
+  #bands(pen, shown, band, wide, of, store) {
+    const x = (k) => this.#x(k, wide);
     this.counted = false;
     const ids = new Set(shown.map((robot) => robot.id));
     shown.forEach((robot, row) => {
@@ -151,7 +179,10 @@ export class Timeline {
     });
     this.#signs(pen, x, of, ids, wide);
     this.#ticks(pen, x, MARKS + shown.length * (band + 3) + 11, of("faint"), wide);
-    const now = x(Math.min(tick + (moving ? share : 0), this.last));
+  }
+
+  /** Draws the hand at the current time. */
+  #hand(pen, now, tall, of) {
     pen.fillStyle = of("now");
     pen.fillRect(now - 4, MARKS - 2, 8, tall - MARKS - 13);
     pen.fillStyle = of("ink");
@@ -159,9 +190,6 @@ export class Timeline {
     pen.beginPath();
     pen.moveTo(now - 5, MARKS - 7); pen.lineTo(now + 5, MARKS - 7); pen.lineTo(now, MARKS); pen.closePath();
     pen.fill();
-    this.#limit();
-    if (this.scrub.value !== String(tick)) this.scrub.value = String(tick);
-    this.scrub.setAttribute("aria-valuetext", `tick ${tick} of ${this.last}. ${activities}`);
   }
 
   /** Draws the signs of each tick side by side, the last first; those that have no room near their tick are left out. */
