@@ -38,7 +38,7 @@ from compose.recording.run import read
 from compose.scenario.scenario_file import load, parse
 from protocol.journal.journal_file import read as frames
 from protocol.messages import Command
-from protocol.mission import Role
+from protocol.mission import ROLES, Role
 from protocol.motion import step, wrap
 from protocol.wire import MalformedFrame, decode, encode
 from tests.commands import PAPER_1, SECTION_IV, on_a_terminal, several_pairs, tandem
@@ -258,6 +258,21 @@ def test_the_trajectory_has_both_paths_the_ranges_and_the_orbits(recordings: Pat
         assert wrap(along - start.heading) == pytest.approx(0.0, abs=1e-9)
     assert len(line(figure, "path-a")) == 49
     assert figure.axes[0].get_aspect() == 1.0
+
+
+def test_an_encounter_far_away_is_drawn_larger_in_an_inset(recordings: Path, tmp_path: Path) -> None:
+    assert not drawn(trajectory.draw(pair(recorded("paper-1", recordings)))).axes[0].child_axes
+    far = PAPER_1.replace("[10.0, 0.0]", "[40.0, 0.0]").replace("[11.3, -0.4", "[41.3, -0.4")
+    run_mission(parse(far, "far", seed=1), tmp_path)
+    told = pair(tmp_path)
+    figure = drawn(trajectory.draw(told))
+    (inset,) = figure.axes[0].child_axes
+    assert told.encounter_tick is not None
+    for role in ROLES:
+        for pose in told.robot(role).path[told.encounter_tick :]:
+            assert inset.get_xlim()[0] < pose.x < inset.get_xlim()[1]
+            assert inset.get_ylim()[0] < pose.y < inset.get_ylim()[1]
+    assert len(found(figure, "path-a")) == 1, "names of marks stay unique"
 
 
 def test_ranges_are_those_that_were_measured_and_contact_is_shaded(recordings: Path) -> None:

@@ -21,6 +21,7 @@ from compose.figures.sheet import (
     circle,
     entry,
     heading,
+    square,
     trace,
 )
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
@@ -29,6 +30,8 @@ from protocol.mission import ROLES, Role
 
 TALLEST_PLANE = 4.6
 """The maximum height of the plane, in inches."""
+INSET, LEAST_ZOOM = 0.3, 1.6
+"""The side of the inset as a fraction of the smaller one of the plane, and the least factor of its scale."""
 MANY = 160
 """The maximum number of markers on a path."""
 RANGE_ARROW = 0.35
@@ -43,7 +46,35 @@ def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
     draw_plane(sheet.panels["plane"], pair)
     sheet.plane("plane", window(pair), TALLEST_PLANE)
     sheet.key(sheet.panels["plane"])
-    return sheet.finished()
+    figure = sheet.finished()
+    _inset(sheet.panels["plane"], pair)
+    return figure
+
+
+def _inset(axes: Axes, pair: PairRecord) -> None:
+    """Draw the encounter larger in a corner without paths if it fills a small part of the plane only."""
+    if pair.encounter_tick is None:
+        return
+    ways = {role: pair.robot(role).path[pair.encounter_tick :] for role in ROLES}
+    left, right, low, high = square([(pose.x, pose.y) for way in ways.values() for pose in way], 0.2, 0.0)
+    (first, last), (bottom, top) = axes.get_xlim(), axes.get_ylim()
+    side = INSET * min(last - first, top - bottom)
+    if not 0.0 < right - left < side / LEAST_ZOOM:
+        return
+    paths = [pose for role in ROLES for pose in pair.robot(role).way]
+    corners = [(x, y) for y in (top - side, bottom) for x in (first, last - side)]
+    x, y = min(
+        corners,
+        key=lambda at: sum([at[0] < one.x < at[0] + side and at[1] < one.y < at[1] + side for one in paths]),
+    )
+    inset = axes.inset_axes((x, y, side, side), transform=axes.transData, zorder=7)
+    draw_plane(inset, pair)
+    for drawn in inset.findobj():
+        drawn.set_gid(None)  # it is drawn a second time
+    for text in inset.texts:
+        text.set_clip_on(True)
+    inset.set(xlim=(left, right), ylim=(low, high), xticks=[], yticks=[], aspect="equal")
+    axes.indicate_inset_zoom(inset, edgecolor=PALE, lw=0.6)
 
 
 def draw_plane(axes: Axes, pair: PairRecord, about: Role | None = None) -> None:

@@ -110,7 +110,7 @@ export class Timeline {
     this.#key = key;
     visible.setTransform(1, 0, 0, 1, 0, 0);
     visible.clearRect(0, 0, canvas.width, canvas.height);
-    visible.drawImage(this.#drawn, 0, 0);
+    if (canvas.width && canvas.height) visible.drawImage(this.#drawn, 0, 0);
     visible.setTransform(ratio, 0, 0, ratio, 0, 0);
     this.#hand(visible, this.#x(now, wide), tall, of);
     this.#limit();
