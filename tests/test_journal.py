@@ -68,9 +68,9 @@ def test_a_journal_cut_anywhere_reads_back_every_whole_frame(tmp_path: Path) -> 
 
 
 @settings(max_examples=50)
-@given(st.lists(st.integers(0, 2000), max_size=12))
+@given(st.lists(st.integers(0, 2000), max_size=12), st.none() | st.integers(1, 500))
 def test_a_journal_read_as_it_grows_gives_each_frame_once(
-    tmp_path_factory: pytest.TempPathFactory, cuts: list[int]
+    tmp_path_factory: pytest.TempPathFactory, cuts: list[int], most: int | None
 ) -> None:
     folder = tmp_path_factory.mktemp("grows")
     data = written(folder / "whole", FRAMES)
@@ -79,7 +79,10 @@ def test_a_journal_read_as_it_grows_gives_each_frame_once(
     tail, read = Tail(growing), []
     for length in [*sorted(min(cut, len(data)) for cut in cuts), len(data)]:
         growing.write_bytes(data[:length])
-        read += tail.news()
+        read += tail.news(most)
+        assert read == FRAMES[: len(read)]
+    while tail.more:
+        read += tail.news(most)
     assert read == FRAMES
     assert tail.news() == []
 

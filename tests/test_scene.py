@@ -18,6 +18,7 @@ from compose.scenario.scenario_file import load
 from compose.view.recorded import scenes, scenes_of
 from compose.view.run_data import RunData
 from compose.view.scene import Scene
+from compose.view.web import sources
 from compose.view.web.sources import Recorded, writers_of
 from compose.view.words import DOING, SEEKING, doing
 from protocol.journal import journal_file
@@ -271,6 +272,26 @@ def test_the_end_is_shown_though_it_comes_after_a_page_has_seen_the_last_tick(
     assert [event.text for event in changed[0].events if event.kind == "end"] == [
         "The mission ends: localised"
     ]
+
+
+def test_a_page_that_is_behind_shows_ticks_of_which_it_has_read_all(
+    paper_1: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(sources, "PORTION_BYTES", 3000)
+    monkeypatch.setattr(sources, "LEAST_OF_A_JOURNAL_BYTES", 700)
+    show, whole = Recorded("", paper_1), scenes_of(read_record(paper_1))
+    heads: list[int] = []
+    show.poll()
+    while show.more:
+        assert show.live
+        if show.head > max([0, *heads]):
+            assert show.setup is not None
+            assert scenes(show.setup, show.known, show.head, show.head) == whole[show.head : show.head + 1]
+            heads.append(show.head)
+        show.poll()
+    assert len(heads) > 3
+    assert show.setup is not None
+    assert scenes(show.setup, show.known) == whole
 
 
 def test_the_process_that_writes_a_journal_is_known_by_its_lock(tmp_path: Path) -> None:

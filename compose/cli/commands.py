@@ -388,6 +388,7 @@ COMMANDS = (
             is published on loopback [default: %(default)s]
         {PAGE_PORT}
         --launched
+        --lockstep
         """,
     ),
     CommandEntry(

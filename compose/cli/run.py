@@ -131,7 +131,9 @@ def _page(
     options: argparse.Namespace, folder: Path, inbox: Inbox
 ) -> AbstractContextManager[PageProcess | None]:
     """Return the context in which the page of the mission is served, with --watch."""
-    return serving(folder, options.port or 0, inbox) if options.watch else nullcontext()
+    if not options.watch:
+        return nullcontext()
+    return serving(folder, options.port or 0, inbox, lockstep=options.rate is None)
 
 
 def _finish(

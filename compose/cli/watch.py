@@ -22,7 +22,10 @@ if TYPE_CHECKING:
     from compose.view.web.site import Site
 
 NICENESS = 10
-"""The niceness of the page's process, so that the processes of the mission get the CPU first."""
+"""The niceness of the page's process, so that the processes of the mission get the CPU first.
+
+In lockstep nobody is late, and a page with less of the CPU than a mission's process never shows what is now.
+"""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -51,7 +54,7 @@ def main(options: argparse.Namespace) -> int:
         raise UserError(f"{what} cannot be used: {error.strerror}") from None
     if not ipaddress.ip_address(options.address).is_loopback:
         say(f"tandem watch: --address: every machine that reaches {options.address} can watch", error=True)
-    if shown.waiting:
+    if shown.waiting and not options.lockstep:
         os.nice(NICENESS)
 
     def ready(stop: Callable[[], None]) -> None:

@@ -48,15 +48,16 @@ class PageProcess(NamedTuple):
 
 
 @contextmanager
-def serving(folder: Path, port: int, inbox: Inbox) -> Iterator[PageProcess]:
+def serving(folder: Path, port: int, inbox: Inbox, *, lockstep: bool) -> Iterator[PageProcess]:
     """Serve the page of the recording in `folder` in this context, and print its address.
 
-    `inbox` receives the end of its process. Raises UserError, with the last line of its standard error, if it
-    is not ready within READY_S.
+    `lockstep` is true if the mission is in lockstep, and `inbox` receives the end of the page's process.
+    Raises UserError, with the last line of its standard error, if it is not ready within READY_S.
     """
     children = Supervisor(inbox, __name__)  # its modules are few
     try:
-        child = children.start(WHAT, "watch", str(folder), "--launched", "--port", str(port))
+        pace = ["--lockstep"] if lockstep else []
+        child = children.start(WHAT, "watch", str(folder), "--launched", *pace, "--port", str(port))
         try:
             page = PageProcess(child, child.receive(READY_S).decode())
         except (TimeoutError, EOFError):

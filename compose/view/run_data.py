@@ -95,12 +95,12 @@ class RunData:
 
     def at(self, tick: int) -> TickData:
         """Return the data of `tick` for modification, created if needed; marks the tick as changed."""
-        down = self.gone if tick > self.last else ()
-        self.last = max(self.last, tick)
         self._touch(tick)
-        if tick not in self.ticks:
-            self.ticks[tick] = TickData(tick, down=set(down))
-        return self.ticks[tick]
+        found = self.ticks.get(tick)
+        if found is None:
+            found = self.ticks[tick] = TickData(tick, down=set(self.gone if tick > self.last else ()))
+            self.last = max(self.last, tick)
+        return found
 
     def between(self, first: int, last: int) -> list[int]:
         """Return the ticks from `first` to `last` with data, in order.
@@ -112,7 +112,8 @@ class RunData:
         return sorted([tick for tick in [*self.ticks] if first <= tick <= last])
 
     def _touch(self, tick: int) -> None:
-        self.touched = tick if self.touched is None else min(tick, self.touched)
+        if self.touched is None or tick < self.touched:
+            self.touched = tick
         while self._meetings and next(reversed(self._meetings)) >= tick:
             self._meetings.popitem()
 
@@ -186,8 +187,9 @@ class RunData:
     def add_observations(self, worlds: Iterable[World]) -> None:
         """Add the Observations that are still missing in the ticks of `worlds`."""
         for world in worlds:
-            known = self.at(world.truth.tick).observations
-            if len(known) < len(world.scenario.robots):
+            data = self.ticks.get(world.truth.tick)
+            if data is None or len(data.observations) < len(world.scenario.robots):
+                known = self.at(world.truth.tick).observations
                 known.update({one.robot: one for one in observations(world) if one.robot not in known})
 
     def present(self, robot: str | None, there: bool) -> None:

@@ -269,17 +269,19 @@ class Tail:
         self.more = False
         """True if the last read has left bytes to be read by the next one."""
 
-    def news(self) -> list[bytes]:
+    def news(self, most: int | None = None) -> list[bytes]:
         """Return the frames that have been added since the last call, of at most JOURNAL_PIECE_BYTES.
 
-        An incomplete frame is read later.
+        If `most` is given, they are those in the next `most` bytes, and at least one. An incomplete frame is
+        read later.
 
         Raises OSError if it cannot be read, CorruptJournal if it contains anything but frames, OtherVersion
         if its first frame has another version.
         """
+        piece = JOURNAL_PIECE_BYTES if most is None else most
         with open_file(self.path) as file:
             file.seek(self.whole)
-            data = file.read(JOURNAL_PIECE_BYTES)
+            data = file.read(piece)
         self.more = False
         frames: list[bytes] = []
         whole = 0
@@ -293,5 +295,7 @@ class Tail:
         if self.whole == 0 and frames and (version := other_version(frames[0])) is not None:
             raise OtherVersion(self.path, version)
         self.whole += whole
-        self.more = len(data) == JOURNAL_PIECE_BYTES
+        self.more = len(data) == piece
+        if not frames and self.more and most is not None:  # the next frame is longer than that
+            return self.news(min(4 * most, JOURNAL_PIECE_BYTES) if most < JOURNAL_PIECE_BYTES else None)
         return frames

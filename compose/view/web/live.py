@@ -61,6 +61,8 @@ MOST_APPEARING = 10_000
 """The maximum number of robots that wait for the query of their configuration."""
 MOST_COUNTED_LINKS = 100_000
 """The maximum number of robots and of links between them of which frames of one mission are stored."""
+FRAMES_AT_ONCE = 1000
+"""The number of frames that one poll processes: some 10 ms of work."""
 STOP_POLL_S = 0.25
 """The interval in s between checks for the stop request, and between attempts to connect."""
 LIVE_QUERY_S = 2.0
@@ -159,6 +161,8 @@ class Listener:
         """The missions by run name, in the order in which they were found."""
         self.reached = False
         """True while connected to a router."""
+        self.more = False
+        """True if the last poll has left frames to be processed by the next one."""
         self._inbox = Inbox("tandem watch")
         self._stop = threading.Event()
         self._looking_since: float | None = None
@@ -175,8 +179,13 @@ class Listener:
         self._thread.join(session.CLOSE_TIMEOUT_S + 1.0)
 
     def poll(self) -> None:
-        """Process the received frames and answers."""
-        while (arrival := self._inbox.next(0.0)).topic != "nothing":
+        """Process received frames and answers, at most FRAMES_AT_ONCE."""
+        self.more = True
+        for _ in range(FRAMES_AT_ONCE):
+            arrival = self._inbox.next(0.0)
+            if arrival.topic == "nothing":
+                self.more = False
+                break
             self._take(arrival)
         for show in self.shows.values():
             show.poll()

@@ -6,6 +6,7 @@ It refuses requests of foreign web pages, and runs missions for browsers on this
 from __future__ import annotations
 
 import asyncio
+import gc
 import ipaddress
 import logging
 import signal
@@ -44,8 +45,8 @@ LIVE_POLL_S = 0.05
 """The interval in s at which runs are polled and updates are sent to pages while a mission is live."""
 IDLE_POLL_S = 0.5
 """The interval in s at which runs are polled and updates are sent to pages while no mission is live."""
-PLAYERS_AT_ONCE = 4000
-"""The maximum number of robots times ticks in one answer: some megabytes and some 10 ms of work."""
+PLAYERS_AT_ONCE = 1000
+"""The maximum number of robots times ticks in one answer: half a megabyte and some 10 ms of work."""
 HEADERS = {
     b"content-security-policy": b"default-src 'self'; style-src 'self' 'unsafe-inline'; "
     b"img-src 'self' data:; frame-ancestors 'none'",
@@ -62,6 +63,8 @@ LONGEST_SERIES_S = 10.0
 """The wall time in s that the series of one request may take."""
 MAX_CHANGE_BYTES = 8192
 """The maximum size of a request to change a mission."""
+NEWS = "/api/news"
+"""The path of the events of `_news`, whose answer lasts as long as the page is open."""
 EMBEDDED = "/one"
 """The path of the page of one recording, which only the page of two recordings embeds."""
 
@@ -259,22 +262,23 @@ def application(site: Site) -> Starlette:
             Route("/api/shows/{name}/changed.toml", answers.changed_file, methods=["POST"]),
             Route("/api/shows/{name}/series", answers.series),
             Route("/api/shows/{name}/thumbnail", answers.thumbnail),
-            Route("/api/news", answers.news),
+            Route(NEWS, answers.news),
             Mount("/page", StaticFiles(directory=PAGE)),
         ],
         exception_handlers={_Refused: _refusal, UserError: _refusal},
-        middleware=[Middleware(_Sealed)],
+        middleware=[Middleware(_Sealed, site)],
     )
 
 
 class _Sealed:
     """Middleware that refuses requests of foreign web pages (see `origin`), and adds HEADERS to every answer.
 
-    A header that the answer has already stays.
+    A header that the answer has already stays. It counts the requests that are being answered.
     """
 
-    def __init__(self, app: ASGIApp) -> None:
+    def __init__(self, app: ASGIApp, site: Site) -> None:
         self._app = app
+        self._site = site
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         async def sealed(message: Message) -> None:
@@ -287,7 +291,12 @@ class _Sealed:
         headers = Headers(scope=scope)
         why = refusal(headers.getlist("host"), headers.getlist("origin"))
         app = self._app if why is None else PlainTextResponse(f"{why}\n", 403)
-        await app(scope, receive, sealed)
+        counted = scope["path"] != NEWS
+        self._site.answering += counted
+        try:
+            await app(scope, receive, sealed)
+        finally:
+            self._site.answering -= counted
 
 
 def _number(request: Request, name: str, default: int) -> int:
@@ -392,16 +401,28 @@ async def _serve(site: Site, taken: socket.socket, ready: Ready) -> None:
 
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         loop.add_signal_handler(number, stop)
-    site.poll()
+    reading_s = _polled(site)
     serving = asyncio.create_task(server.serve(sockets=[taken]))
     announced = False
     while not serving.done():
         if server.started and not announced:
             announced = True
             ready(lambda: _soon(loop, stop))
-        await asyncio.wait([serving], timeout=LIVE_POLL_S if site.waiting or not announced else IDLE_POLL_S)
-        site.poll()
+        pause = LIVE_POLL_S if site.waiting or not announced else IDLE_POLL_S
+        if site.more:  # requests come first: while there are any, they have half of the time
+            pause = reading_s if site.answering else 0.0
+        await asyncio.wait([serving], timeout=pause)
+        reading_s = _polled(site)
     await serving
+
+
+def _polled(site: Site) -> float:
+    """Poll `site`, and return the wall time in s that it has taken."""
+    begun = time.monotonic()
+    site.poll()
+    if site.waiting:  # the data of a run stays: looking through it for garbage takes a third of the time
+        gc.freeze()
+    return time.monotonic() - begun
 
 
 def _soon(loop: asyncio.AbstractEventLoop, stop: Callable[[], None]) -> None:

@@ -55,6 +55,10 @@ class Site:
         self.changed = ChangedMissions(self.work)
         self.recorded = shows or []
         self.listeners = listeners or []
+        self.more = False
+        """True if the last poll has left data to be read by the next one."""
+        self.answering = 0
+        """The number of requests that are being answered, those of news excepted."""
 
     @property
     def shows(self) -> dict[str, WatchedRun]:
@@ -138,12 +142,13 @@ class Site:
         self.changed.close()
 
     def poll(self) -> None:
-        """Read new data."""
+        """Read new data, of each run a portion whose size is bounded."""
         for show in self.recorded:
             with suppress(OSError):
                 show.poll()
         for listener in self.listeners:
             listener.poll()
+        self.more = any(show.more for show in self.recorded) or any(one.more for one in self.listeners)
 
     def concluded(self) -> None:
         """Mark the recordings as complete, because their writers have ended."""

@@ -27,6 +27,10 @@ from world.world_journal import WorldJournalReading
 
 REVISIONS_KEPT = 1000
 """The number of stored revisions. A page that has missed more reloads all scenes."""
+PORTION_BYTES = 96 << 10
+"""The number of bytes of a recording that one poll reads: some hundred ticks of a pair, some ms of work."""
+LEAST_OF_A_JOURNAL_BYTES = 4 << 10
+"""The number of these bytes that are read of each journal, however many there are."""
 UNANSWERED = 5
 """The maximum number of ticks by which the head goes back to a tick with all commands."""
 
@@ -41,6 +45,8 @@ class WatchedRun(ABC):
 
     live: bool
     """True if new data may arrive."""
+    more = False
+    """True if the last poll has left data to be read by the next one."""
     setup: RunSetup | None
     """The static data of the run; None until it is known."""
 
@@ -56,7 +62,7 @@ class WatchedRun(ABC):
 
     @abstractmethod
     def poll(self) -> None:
-        """Read new data."""
+        """Read new data, of a size that is bounded."""
 
     def revised(self) -> None:
         """Record a revision if the data has changed. Subclasses call this at the end of `poll`."""
@@ -120,7 +126,11 @@ class Recorded(WatchedRun):
         self._expected = expected
         self._over = False
         self._tails: dict[str, Tail] = {}
-        self._reading = WorldJournalReading()
+        self._through: dict[str, int] = {}
+        """The tick of the latest message that has been read in each journal, by the journal's name."""
+        self._commands: dict[bytes, Any] = {}
+        """The Commands in the world's journal by frame, until those of the agents' have been read."""
+        self._reading = WorldJournalReading(self._commands)
         self._writers: dict[str, int] = {}
         """The id of the process that last held the lock of each journal, by the journal's name."""
 
@@ -130,7 +140,11 @@ class Recorded(WatchedRun):
         return self._reading.world.scenario if self._reading.world is not None else None
 
     def poll(self) -> None:
-        """Read new frames of the journals. Raises OSError."""
+        """Read new frames of the journals, of at most about PORTION_BYTES. Raises OSError."""
+        self._poll(PORTION_BYTES)
+
+    def _poll(self, most: int | None) -> None:
+        """Read new frames, of `most` bytes, or as many as `Tail` reads at once. Raises OSError."""
         # Locks before journals: then all frames of a process that has ended are read.
         writers = writers_of(journals_in(self.folder))
         written = self._expected or bool(writers)
@@ -138,37 +152,47 @@ class Recorded(WatchedRun):
             return
         setup = self.setup
         try:
-            self.read()
+            self.read(most)
         except OSError:  # a recording that cannot be read as a whole is not shown in parts
-            self.setup = setup
+            self.setup, self.more = setup, False
             raise
-        more = any(tail.more for tail in self._tails.values())
-        if written:
+        if written and not self.more:
             self._attend(writers)
-        self.live = (written or more) and self.known.end is None
-        self._over = not written and not more  # until a resumed mission writes again
+        self.live = self.more or (written and self.known.end is None)
+        self._over = not written and not self.more  # until a resumed mission writes again
         if self._over:
             self._fill()
         self.revised()
 
-    def read(self) -> None:
-        """Read the frames appended since the last call, as many as `Tail` reads at once. Raises OSError."""
-        for path in journals_in(self.folder):
+    @property
+    def head(self) -> int:
+        """The latest tick to show: one of which all that each journal has of it has been read."""
+        behind = [self._through.get(name, 0) - 1 for name, tail in self._tails.items() if tail.more]
+        return min([super().head, *behind])
+
+    def read(self, most: int | None = None) -> None:
+        """Read frames appended since the last call, of `most` bytes, or as many as `Tail` reads at once.
+
+        Raises OSError.
+        """
+        journals = journals_in(self.folder)
+        if most is not None and journals:
+            most = max(most // len(journals), LEAST_OF_A_JOURNAL_BYTES)
+        for path in journals:
             tail = self._tails.setdefault(path.name, Tail(path))
             try:
-                frames = tail.news()
+                frames = tail.news(most)
                 if path.name == WORLD_JOURNAL:
                     self._add_world(frames, path)
                 else:
-                    for frame in frames:
-                        message = decode(frame, OfRobot, MAX_FRAME_BYTES)
-                        self.known.add(message, len(frame), robot_of(path.name))
+                    self._add_of_robot(frames, robot_of(path.name), path)
             except OtherVersion as error:
                 self._note(f"{self.folder}: {error.versions}; {error.remedy}")  # the same in all journals
             except CorruptJournal as error:
                 self._note(str(error))
             except MalformedFrame as error:
                 self._note(f"{path}: {error}")
+        self.more = any(self._tails[path.name].more for path in journals)
         configs, scenario = self.known.configs, self.scenario
         if scenario is not None:
             for robot in [robot for robot, one in configs.items() if not scenario.is_of(one)]:
@@ -176,6 +200,13 @@ class Recorded(WatchedRun):
                 self._note(f"{path}: belongs to another run: its configuration does not match the world's")
         elif len(configs) > (len(self.setup.robots) if self.setup is not None else 0):
             self.setup = of_configs(self.folder.name, configs)
+
+    def _add_of_robot(self, frames: list[bytes], robot: str, path: Path) -> None:
+        """Add frames of the journal of `robot`. Raises MalformedFrame."""
+        for frame in frames:
+            message = self._commands.pop(frame, None) or decode(frame, OfRobot, MAX_FRAME_BYTES)
+            self.known.add(message, len(frame), robot)
+            self._through[path.name] = getattr(message, "tick", self._through.get(path.name, -1))
 
     def _add_world(self, frames: list[bytes], path: Path) -> None:
         reading = self._reading
@@ -192,6 +223,7 @@ class Recorded(WatchedRun):
             self.setup = of_scenario(reading.world.scenario, self._mode())
         for tick in reading.ticks[first_new:]:
             self.known.add_tick(tick)
+        self._through[path.name] = reading.world.truth.tick
         if reading.recomputed_end is None:
             self.known.add_world(reading.world)
         if reading.end is not None:
@@ -222,9 +254,9 @@ class Recorded(WatchedRun):
 
     def load(self, stopped: Callable[[], bool] = lambda: False) -> None:
         """Read all that is in the journals, unless `stopped` returns true meanwhile. Raises OSError."""
-        self.poll()
-        while any(tail.more for tail in self._tails.values()) and not stopped():
-            self.poll()
+        self._poll(None)
+        while self.more and not stopped():
+            self._poll(None)
 
     def _attend(self, writers: dict[str, int]) -> None:
         """Record which processes have ended or have been replaced."""
