@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import gc
 import os
 import shutil
 import signal
@@ -57,6 +58,11 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         begun = (len(slow) + len(others)) // left - len(slow) // left
         items += [slow.pop(0) for _ in range(len(slow) // left)] + others[:begun]
         del others[:begun]
+
+
+def pytest_collection_finish() -> None:
+    """Exempt what has been imported and collected from the search for garbage, of which it would be most."""
+    gc.freeze()
 
 
 def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001  # the hook requires the name

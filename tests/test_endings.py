@@ -99,7 +99,7 @@ def long(tmp_path: Path) -> Path:
 # --- stopped by a signal ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("moment", series(MOMENTS, 4))
+@pytest.mark.parametrize("moment", series(MOMENTS, 2))
 def test_an_interrupted_run_reports_it_and_leaves_no_process(
     moment: str, endless: Path, tmp_path: Path
 ) -> None:
@@ -134,7 +134,7 @@ def test_a_signal_that_does_not_interrupt_a_wait_ends_it_all_the_same() -> None:
         signal.signal(signal.SIGUSR1, before)
 
 
-@pytest.mark.parametrize("moment", series(LAST_MOMENTS))
+@pytest.mark.parametrize("moment", series(LAST_MOMENTS, 0))
 def test_a_run_interrupted_as_it_ends_reports_the_outcome_or_the_interruption(
     moment: str, long: Path, tmp_path: Path
 ) -> None:
@@ -151,7 +151,7 @@ def test_a_run_interrupted_as_it_ends_reports_the_outcome_or_the_interruption(
         assert ended[1:] == (f"localised after {LONG_TICKS} ticks\n", "")
 
 
-@pytest.mark.parametrize("delay", series([round(0.15 * draw(), 3) for _ in range(6)], 3))
+@pytest.mark.parametrize("delay", series([round(0.15 * draw(), 3) for _ in range(6)]))
 def test_a_run_interrupted_while_it_starts_leaves_no_process(
     delay: float, endless: Path, tmp_path: Path
 ) -> None:
@@ -201,7 +201,7 @@ def test_an_agent_that_searches_for_a_world_can_be_interrupted() -> None:
 # --- loss of a process ------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("child", ["world", "agent a", "agent b"])
+@pytest.mark.parametrize("child", series(["world", "agent b", "agent a"], 2))
 def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
     child: str, endless: Path, tmp_path: Path
 ) -> None:

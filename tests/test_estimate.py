@@ -52,6 +52,7 @@ from docs import recorded_claims
 from protocol.motion import Pose, step, travelled
 from protocol.noise import Noise, ProfileName, VelocityNoise
 from tests.commands import tandem
+from tests.series import series
 
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 NEES_99_9 = 16.27
@@ -701,14 +702,16 @@ def assumed(profile: ProfileName | None, factor: float) -> AssumedNoise | None:
     )
 
 
-@pytest.mark.parametrize("factor", [0.01, 100.0])
+@pytest.mark.parametrize("factor", series([0.01, 100.0]))
 @pytest.mark.parametrize(
     ("profile", "bias", "own", "reason"),
     [
         (None, 0.0, False, ""),
         ("uwb", 0.35, False, ""),
-        ("uwb-calibrated", 0.25, True, "the profile 'uwb' explains them better"),
-        (None, 0.0, True, ""),
+        pytest.param(
+            *("uwb-calibrated", 0.25, True, "the profile 'uwb' explains them better"), marks=pytest.mark.long
+        ),
+        pytest.param(None, 0.0, True, "", marks=pytest.mark.long),
     ],
     ids=["stated", "uwb", "another profile is better", "odometry without a noise, and heights"],
 )

@@ -115,6 +115,7 @@ def test_guided_play_of_thousands_of_ticks_takes_about_a_minute(opened: Open, ad
     assert 50 < sum(tick < encounter for tick in ticks) < 70
 
 
+@pytest.mark.long
 def test_guided_play_stops_at_each_kill_and_at_the_first_fault_of_each_kind(
     opened: Open, address: str
 ) -> None:
@@ -234,6 +235,7 @@ DISCS = """async () => {
 }"""
 
 
+@pytest.mark.long
 def test_the_camera_keeps_every_hypothesis_in_view_and_those_being_ruled_out(
     opened: Open, address: str
 ) -> None:
@@ -256,6 +258,7 @@ FINISHED = """async (verdicts) => {
 }"""
 
 
+@pytest.mark.long
 def test_once_its_pair_has_finished_the_camera_shows_all_pairs(opened: Open, address: str) -> None:
     page = opened(address)
     assert set(page.evaluate(FINISHED, ["a0"])) == {1}
@@ -328,6 +331,7 @@ def test_with_reduced_motion_nothing_moves_between_two_ticks(opened: Open, addre
     assert all(len(found) == 1 for (tick, _), found in pictures.items() if tick < 48)
 
 
+@pytest.mark.long
 def test_the_server_tells_what_faults_cost_once_it_has_run_the_mission_without(
     opened: Open, tmp_path: Path
 ) -> None:

@@ -12,6 +12,7 @@ from compose.launch import in_process
 from compose.scenario.scenario_file import load, parse
 from protocol.messages import Localised
 from tests.commands import SECTION_IV
+from tests.series import series
 from world.referee import errors
 from world.scenario import Scenario
 
@@ -40,7 +41,7 @@ def with_start(rho0: float, heading: float) -> Scenario:
 
 
 @pytest.mark.parametrize("direction", HEADINGS)
-@pytest.mark.parametrize("rho0", RADII)
+@pytest.mark.parametrize("rho0", series(RADII, 6))
 def test_nearly_indistinguishable_starts_localise(rho0: float, direction: str) -> None:
     for offset in OFFSETS:
         assert_localised(with_start(rho0, HEADINGS[direction] + offset))

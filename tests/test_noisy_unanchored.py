@@ -142,7 +142,11 @@ def test_the_audit_and_the_replay_find_nothing_where_nothing_is_wrong() -> None:
         ({"drop_outs": 0.2}, {}),
         pytest.param({"outliers": 0.05}, {}, marks=pytest.mark.long),
         pytest.param({}, {"outliers": 0.05}, marks=pytest.mark.long),
-        ({}, {"anchor_sigma": 0.075, "mutual_sigma": 0.075, "odometry": {"scale": -0.01}}),
+        pytest.param(
+            {},
+            {"anchor_sigma": 0.075, "mutual_sigma": 0.075, "odometry": {"scale": -0.01}},
+            marks=pytest.mark.long,
+        ),
     ],
 )
 def test_a_recording_with_other_noise_is_audited_and_replayed_without_a_finding(

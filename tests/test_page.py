@@ -143,6 +143,7 @@ CENTRE = """() => {
 }"""
 
 
+@pytest.mark.long
 def test_an_estimate_moves_between_ticks_like_its_robot(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=20&truth=0&robot=a")
     until_shown(page, 20)
@@ -230,6 +231,7 @@ JOINED = """async () => {
 }"""
 
 
+@pytest.mark.long
 def test_a_robot_that_joins_is_on_the_timeline_once_the_page_has_its_setup(
     opened: Open, address: str
 ) -> None:
@@ -304,7 +306,7 @@ TIMELESS = """() => {
 
 @pytest.mark.parametrize(
     "click",
-    series(["#back", "#log li:first-child button", "#on", "#truth", "#near", ".card[data-robot=a] .name"], 2),
+    series(["#back", "#log li:first-child button", "#on", "#truth", "#near", ".card[data-robot=a] .name"]),
 )
 def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(
     opened: Open, address: str, click: str
@@ -344,6 +346,7 @@ def test_space_plays_though_the_closed_help_still_has_the_focus(opened: Open, ad
     until_shown(page, 48)
 
 
+@pytest.mark.long
 def test_who_goes_by_keyboard_presses_a_button_with_space(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=20")
     until_shown(page, 20)

@@ -76,6 +76,7 @@ TINTS = """async (ticks) => {
 }"""
 
 
+@pytest.mark.long
 def test_a_configuration_keeps_its_tint_though_its_place_changes(opened: Open, address: str) -> None:
     """Each robot drives 1 m along x; under noise, the order is that of the probabilities."""
     far = [5, 5]
@@ -91,6 +92,7 @@ def test_a_configuration_keeps_its_tint_though_its_place_changes(opened: Open, a
 # --- predicted distances ------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_the_predicted_distances_and_their_least_difference_are_listed(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=47")
     until_shown(page, 47)

@@ -184,6 +184,7 @@ COVERED = """() => {
 }"""
 
 
+@pytest.mark.long
 def test_no_label_covers_a_robot_whose_bearing_is_unknown(opened: Open, address: str) -> None:
     page = opened(address)
     until_shown(page, 0)

@@ -249,6 +249,7 @@ def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open,
     until_shown(older, 7)
 
 
+@pytest.mark.long
 def test_a_list_that_arrives_before_the_next_frame_does_not_bring_the_old_mission_back(
     opened: Open, address: str
 ) -> None:
@@ -294,6 +295,7 @@ def test_the_form_works_from_the_keyboard_and_saves_the_scenario(opened: Open, a
     expect(page.locator("#changes")).to_be_hidden()
 
 
+@pytest.mark.long
 @chromium_only
 def test_an_empty_field_and_what_the_server_refuses_run_nothing(opened: Open, address: str) -> None:
     page = opened_form(opened, address)

@@ -14,6 +14,7 @@ from tests.browser import Open, picture, scrub_to, shot, until_shown, watching
 from tests.commands import tandem
 
 
+@pytest.mark.long
 def test_the_sequence_diagram_says_what_became_of_the_reports_of_the_tick(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=46")
     until_shown(page, 46)

@@ -178,6 +178,7 @@ STROKES = """() => new Promise((drawn) => {
 """A function of the page that draws again, and returns colour and opacity of each piece of a trail."""
 
 
+@pytest.mark.long
 def test_all_seven_copies_of_a_path_have_the_colour_of_its_robot(opened: Open, address: str) -> None:
     page = opened(f"{address}#tick=5")
     until_shown(page, 5)
