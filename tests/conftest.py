@@ -17,7 +17,7 @@ from compose.scenario.scenario_file import load
 from tests.browser import Open, launched, pages, watching
 from tests.commands import tandem
 
-settings.register_profile("tandem", derandomize=True, deadline=None, database=None)
+settings.register_profile("tandem", derandomize=True, deadline=None, database=None, max_examples=60)
 settings.load_profile("tandem")
 
 

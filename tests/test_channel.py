@@ -108,7 +108,7 @@ def test_without_a_fault_every_report_is_received_in_its_tick(contact: list[bool
         assert not any(air.damaged or air.flying for air in airs)
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(plans, meetings, seeds)
 @pytest.mark.long
 def test_no_report_is_sent_or_received_out_of_contact(
@@ -119,7 +119,7 @@ def test_no_report_is_sent_or_received_out_of_contact(
         assert contact[tick]
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(plans, meetings, seeds)
 @pytest.mark.long
 def test_a_report_comes_at_most_once_unless_a_fault_doubles_it(
@@ -130,7 +130,7 @@ def test_a_report_comes_at_most_once_unless_a_fault_doubles_it(
     assert all(count <= 2**doubling for count in copies.values())
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(plans, meetings, seeds)
 @pytest.mark.long
 def test_a_report_comes_within_the_delays_of_the_faults_that_were_there_when_it_was_sent(
@@ -143,7 +143,7 @@ def test_a_report_comes_within_the_delays_of_the_faults_that_were_there_when_it_
         assert least <= now - tick <= most
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(plans, meetings, seeds)
 def test_a_fault_plan_and_a_seed_determine_all_deliveries(
     plan: list[Fault], contact: list[bool], seed: int

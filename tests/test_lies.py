@@ -241,7 +241,7 @@ logs = st.lists(runs, min_size=1, max_size=8).map(
 ticks = st.none() | st.integers(0, 40)
 
 
-@settings(max_examples=100)
+@settings(max_examples=60)
 @given(logs, st.sampled_from([*OF_DRIVES, *OF_STARTS]), ticks, ticks, st.integers(1, 40))
 def test_the_false_log_of_an_attacker_only_grows(
     log: MotionLog, attack: Attack, parted: int | None, later: int | None, seen: int
@@ -258,7 +258,7 @@ def test_the_false_log_of_an_attacker_only_grows(
     ) == whole.between(0, seen)
 
 
-@settings(max_examples=50)
+@settings(max_examples=30)
 @given(logs, st.integers(0, 10), st.integers(0, 10), st.floats(-3.0, 3.0))
 def test_a_rotation_turns_what_was_driven_in_its_part_and_nothing_after(
     log: MotionLog, parted: int, orbit: int, angle: float

@@ -66,7 +66,7 @@ def deliveries(draw: st.DrawFn) -> tuple[list[MotionLog], list[tuple[int, int]]]
     return books, draw(st.permutations(acknowledgements + again))
 
 
-@settings(max_examples=200)
+@settings(max_examples=80)
 @given(deliveries())
 @example((prefixes([(1.0, 0.0, 1.5)] * 300), [(300, 0), (300, 0)]))
 def test_reports_in_any_order_repeated_and_lost_give_back_the_log(

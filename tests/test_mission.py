@@ -104,7 +104,7 @@ def after(place: Pose, v: float, omega: float, mission: Mission) -> float:
     return math.hypot(end.x, end.y)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(second_points(), st.sampled_from(VARIANTS))
 @example((SECTION_IV, [Pose(0.7, 2.8, 1.25), Pose(0.7, -2.8, -1.25)]), "paper")
 def test_eq_5_keeps_the_nearer_branch_in_range(

@@ -40,7 +40,7 @@ from world.truth import Truth
 from world.world_journal import Tick, WorldHistory
 
 Floats = NDArray[np.float64]
-N = 20_000
+N = 6_000
 """The number of draws in a statistical test."""
 Z = 4.5
 """The tolerance of a statistic in standard errors, exceeded by one in 150 000 seeds."""

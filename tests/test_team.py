@@ -321,7 +321,7 @@ ANY_REPORT = st.builds(
 )
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=40, deadline=None)
 @given(st.lists(ANY_REPORT, max_size=3))
 def test_whatever_a_report_contains_it_ends_no_robot(reports: list[TeamReport]) -> None:
     state, seen = REACHED

@@ -187,7 +187,7 @@ def test_for_any_n_a_rotation_about_the_anchor_is_indistinguishable(
         assert place(other) == pytest.approx(cmath.rect(1.0, beta) * place(one), abs=1e-12)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.floats(0.5, 3.0), angles, st.lists(forwards, min_size=2, max_size=6))
 @pytest.mark.long
 def test_three_points_or_more_that_are_not_collinear_leave_rotations_only(
@@ -203,7 +203,7 @@ def test_three_points_or_more_that_are_not_collinear_leave_rotations_only(
     assert wrap(found[0] - heading) == pytest.approx(0.0, abs=FITS)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(
     st.floats(0.5, 3.0),
     angles,
@@ -262,7 +262,7 @@ def test_a_third_range_distinguishes_the_branches_unless_omega_1_makes_full_turn
 # --- several anchors -------------------------------------------------------------------------------------
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.tuples(points, points, points), st.floats(1.0, 10.0), points, angles)
 @pytest.mark.long
 def test_3_plus_1_leaves_two_trajectories(
@@ -282,7 +282,7 @@ def test_3_plus_1_leaves_two_trajectories(
     assert one == pytest.approx(other.conjugate(), abs=1e-6)
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.tuples(points, points), st.floats(1.0, 10.0), points, angles)
 @pytest.mark.long
 def test_2_plus_1_leaves_two_trajectories_for_each_distance_of_q_2_from_m_1(
@@ -304,7 +304,7 @@ def test_2_plus_1_leaves_two_trajectories_for_each_distance_of_q_2_from_m_1(
     assert sorted(there) in ([0, 2], [2, 2])
 
 
-@settings(max_examples=300)
+@settings(max_examples=100)
 @given(st.floats(0.5, 12.0), points, st.tuples(points, points), angles, angles)
 @pytest.mark.long
 def test_eq_7_has_exactly_the_placements_that_brute_force_finds(

@@ -111,7 +111,7 @@ def groups(least: int, most: int) -> st.SearchStrategy[Anchors]:
 
 
 @given(groups(2, 14), st.floats(0.1, 3.0), st.floats(0.0, 60.0))
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=15, deadline=None)
 def test_a_plan_is_possible_and_ends_at_its_bound(anchors: Anchors, speed: float, meeting: float) -> None:
     seed_time = orbit_time(anchors)
     plan = group_plan(anchors, seed_time, speed, meeting)
@@ -261,7 +261,7 @@ drawn_groups = st.builds(
 
 
 @given(drawn_groups)
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_a_forest_of_sectors_ends_within_the_proved_factor_of_the_lower_bound(group: Group) -> None:
     forest = sector_forest(group.times, group.anchors, group.meeting)
     meetings = tuple(planned_meetings(forest, group.times))
@@ -272,7 +272,7 @@ def test_a_forest_of_sectors_ends_within_the_proved_factor_of_the_lower_bound(gr
 @given(drawn_groups)
 @example(Group(200, 0.0, 12, plans.fan))
 @example(Group(200, 1000.0, 1, plans.fan))
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_each_cell_is_localised_within_the_proved_time_after_its_first_meeting(group: Group) -> None:
     forest = sector_forest(group.times, group.anchors, group.meeting)
     ends, root = forest.ends(group.times), {b: b for _, b in forest.seeds}

@@ -267,7 +267,7 @@ def test_a_hostile_body_is_refused(body: bytes) -> None:
     refuses(framed(body), Scenario)
 
 
-@settings(max_examples=500)
+@settings(max_examples=200)
 @given(st.binary(max_size=300))
 @example(b"")
 def test_random_bytes_are_refused(frame: bytes) -> None:
@@ -291,13 +291,13 @@ msgpack_values = st.recursive(
 )
 
 
-@settings(max_examples=150)
+@settings(max_examples=60)
 @given(st.binary(max_size=60) | msgpack_values.map(packed))
 def test_any_body_is_a_message_or_refused(body: bytes) -> None:
     assert isinstance(_understood(framed(body)), Message | None)
 
 
-@settings(max_examples=500)
+@settings(max_examples=200)
 @given(st.sampled_from(EXAMPLES), st.data(), msgpack_values)
 @pytest.mark.long
 def test_a_message_with_anything_anywhere_is_a_message_or_refused(

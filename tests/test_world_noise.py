@@ -32,6 +32,7 @@ from tests.test_noise import (
     APART,
     RHO_A,
     RHO_B,
+    N,
     Z,
     are_uncorrelated,
     at_tick,
@@ -52,8 +53,6 @@ from world.truth import Truth
 from world.world_noise import WorldNoise
 
 Floats = NDArray[np.float64]
-N = 6_000
-"""The number of draws in a statistical test."""
 UNLIKELY = 1e-5
 """The smallest p-value of a test with a fixed seed."""
 TOLD = "anchor_sigma = 0.05\nmutual_sigma = 0.05"
