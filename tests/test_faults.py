@@ -192,13 +192,16 @@ class Played(NamedTuple):
 
 @pytest.fixture(
     scope="module",
-    params=[
-        (RANDOM + ROUGH, []),
-        (RANDOM, PLANS["all together"]),
-        (RANDOM.replace("[planner]", f"[mission.noise]\n{NOISE}\n[planner]"), PLANS["bursts"]),
-        (several_pairs(2), ["loss=0.3, reorder=0.5", "c<->d: delay=1..4, corrupt=0.3"]),
-    ],
-    ids=["of a file", "all together", "noise", "two pairs"],
+    params=series(
+        [
+            (RANDOM + ROUGH, []),
+            (several_pairs(2), ["loss=0.3, reorder=0.5", "c<->d: delay=1..4, corrupt=0.3"]),
+            (RANDOM, PLANS["all together"]),
+            (RANDOM.replace("[planner]", f"[mission.noise]\n{NOISE}\n[planner]"), PLANS["bursts"]),
+        ],
+        2,
+    ),
+    ids=["of a file", "two pairs", "all together", "noise"],
 )
 def both(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Played:
     text, faults = request.param

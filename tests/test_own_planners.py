@@ -322,7 +322,7 @@ def test_check_planner_says_why_processes_did_not_complete_the_mission(
     assert str(wrong.wrong) == "the mission failed: no answer from b at tick 17 for 30 s"
 
 
-@pytest.mark.parametrize("name", [OWN, "assured", "paper"])
+@pytest.mark.parametrize("name", series([OWN, "assured", "paper"]))
 def test_check_planner_passes_a_sound_planner(name: str) -> None:
     ended = command("check-planner", name, "--mission", "paper-1", "--fault", FAULTS)
     if name == "paper":  # it has no rule for lost reports

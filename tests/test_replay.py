@@ -247,9 +247,3 @@ def test_a_frame_of_a_wrong_length_is_not_a_truncation(recording: Path) -> None:
     ended = tandem("replay", recording)
     assert (ended.status, ended.out) == (2, "")
     assert ended.err.startswith(f"tandem replay: {recording / A}: damaged at byte ")
-
-
-def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
-    ended = tandem("replay", tmp_path)
-    assert (ended.status, ended.out) == (2, "")
-    assert ended.err == f"tandem replay: {tmp_path} contains no recording: there is no world.journal\n"
