@@ -96,6 +96,8 @@ def stop_by_signal(inbox: Inbox) -> None:
     run, so that a signal cannot interrupt the output and the files at the end of a run.
     """
     _handle(lambda number, _: inbox.put("stop", signal.Signals(number).name))
+    if INTERRUPTION.signal_name is not None:  # a library has dropped its error
+        inbox.put("stop", INTERRUPTION.signal_name)
 
 
 def _handle(handler: Callable[[int, FrameType | None], None]) -> None:
