@@ -11,7 +11,8 @@ from msgspec.structs import replace
 from agent.estimation.fit import TO_THE_END, Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.beacon_guesses import start_of
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, near_anchors
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, Errors, Places, Track
 from protocol.noise import Noise
 

@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.following import ClaimRule
-from agent.estimation.gaussian.joint_ranges import near_anchors
+from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import track
 from agent.estimation.problem import Problem
 from compose.cli import estimate as estimate_command

@@ -21,7 +21,8 @@ from agent.estimation.facts import (
     mutual_range,
 )
 from agent.estimation.fit import Fit, Start, fits
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.gaussian.search import search
 from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
 

@@ -30,8 +30,8 @@ from agent.estimation.gaussian.joint_ranges import (
     MOST_RANGES_BY_EXACT_ODOMETRY,
     JointMeasurements,
     Silence,
-    near_anchors,
 )
+from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.placement_guesses import _encounter, placements
 from agent.estimation.gaussian.search import COARSE_STILL, _until_now, of_anchor, search, starts_about

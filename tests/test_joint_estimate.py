@@ -27,7 +27,8 @@ from agent.estimation.facts import (
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.joint_claims import decisive_ranges, displaced_anchor, undetermined
-from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements, joint_measurements
+from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements
+from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import of_joint

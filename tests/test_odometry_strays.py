@@ -9,7 +9,8 @@ from msgspec.structs import replace
 
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.measured_rows import joint_measurements
 from compose.recording.estimating.noise_files import AssumedNoise
 from protocol.motion import wrap
 from protocol.noise import Noise

@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 import tandem
 from agent.estimation.fit import Start, fits
-from agent.estimation.gaussian.joint_ranges import joint_measurements
+from agent.estimation.gaussian.measured_rows import joint_measurements
 from compose import scenario
 from compose.errors import PlannerFailed, UserError
 from compose.recording.run import read

@@ -13,7 +13,8 @@ from msgspec.structs import replace
 from agent.estimation import gauss_newton, smoother
 from agent.estimation.fit import Start, fits
 from agent.estimation.gauss_newton import Convergence, Fitted, Point, moved, point_at
-from agent.estimation.gaussian.joint_ranges import PosePrior, joint_measurements
+from agent.estimation.gaussian.joint_ranges import PosePrior
+from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
 from agent.estimation.smoother import Measured, Singular, effect_of

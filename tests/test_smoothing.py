@@ -20,7 +20,8 @@ from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
 from agent.estimation.gaussian import joint_ranges, odometry_noise
 from agent.estimation.gaussian.claim_rivals import FAR_ANCHOR, _holding
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, near_anchors
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import (
     OdometryNoiseModel,
     Projection,

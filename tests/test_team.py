@@ -17,7 +17,8 @@ import tandem
 from agent.estimation.gaussian.claim_agreement import united
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
-from agent.planning.team import TeamPlanner, TeamState
+from agent.planning.team import TeamPlanner
+from agent.planning.team_state import TeamState
 from compose.audit.rules import audit_run, replayed
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission

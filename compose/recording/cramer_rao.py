@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from agent.estimation.gaussian.joint_ranges import near_anchors
+from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.reachable_accuracy import position_sigmas
 from compose.recording.run import Run

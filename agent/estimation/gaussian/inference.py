@@ -18,7 +18,8 @@ from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.consistency import Inconsistency
 from agent.estimation.gaussian.evidence import anchor_evidence
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, Listed, Silence, near_anchors
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, Silence
+from agent.estimation.gaussian.measured_rows import Listed, near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track, variances
 from agent.estimation.gaussian.own_sensors import Doubt, doubt
 from agent.estimation.gaussian.placement_guesses import STARTS

@@ -1,13 +1,12 @@
 """The measurements of any number of robots for one fit: paths, ranges to anchors and ranges between robots.
 
-They are a function of a set of facts, in canonical order: robots by name, ranges by kind, radios and tick.
 An anchor that is not surveyed is a robot that stands: its position is estimated with the poses.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -16,9 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.elementary import hypot
-from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange, StartPose
-from agent.estimation.gaussian.odometry_noise import Array, Places, Track, track
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from agent.estimation.facts import AnchorPlace
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.solver import Solver
 from protocol.noise import Noise, Priors
 
@@ -30,13 +28,6 @@ MOVED = 0.01
 
 HELD = 1e24
 """The information (1 / rad^2) of a heading that is held: more than any ranges have."""
-
-OF_START = 1e-3
-"""The sigma (m, rad) of an exact pose at tick 0, as a fraction of that of a range in m.
-
-Without it, the covariance of a robot that only its odometry moves would be singular, and no claim. With more,
-the covariances of other robots would contain it.
-"""
 
 MOST_CORRELATED_RANGES = 96
 """The most ranges of a pair of radios that a fit weighs if odometry is noisy.
@@ -422,160 +413,3 @@ def _recent(count: int, most: int) -> Places:
     while -(-older // step) > most - most // 2:
         step *= 2
     return np.concatenate((np.arange(0, older, step), np.arange(older, count)))
-
-
-Listed = Sequence[tuple[int, float]]
-"""Ticks and ranges in m, as the robots log them."""
-
-
-def near_anchors(
-    paths: Sequence[Track],
-    own: Sequence[Listed],
-    places: Sequence[tuple[float, float]],
-    noise: Noise,
-    reach: float,
-    mutual: Listed = (),
-    silent: tuple[Silence, ...] = (),
-) -> JointMeasurements:
-    """Return the measurements of robots with one anchor each, the first of which is the origin.
-
-    `own` contains the ranges of each to its anchor, whose place (m) is in `places`. `mutual` contains those
-    between the first two.
-    """
-    lists, robots = [*own, mutual], len(paths)
-    counts = [len(one) for one in lists]
-    kind = np.repeat(np.arange(robots + 1), counts)
-    sigmas = [noise.anchor_sigma] * robots + [noise.mutual_sigma]
-    ranges = JointRanges(
-        np.array([rho for ranges in lists for _, rho in ranges], np.float64),
-        np.array([tick for ranges in lists for tick, _ in ranges], np.intp),
-        np.repeat([max(sigma, SIGMA_FLOOR) for sigma in sigmas], counts),
-        kind % robots,
-        np.where(kind == robots, 1, -1),
-        np.repeat(np.array([*places, (0.0, 0.0)]), counts, 0),
-        kind,
-    )
-    return JointMeasurements(
-        *(("a", "b")[:robots], (), (), tuple(paths), ranges, paths[0].period, (0.0, 0.0), noise),
-        reach=reach,
-        silent=silent,
-    )
-
-
-class MeasuredRow(NamedTuple):
-    """A range with the names of its radios, in the order of the ranges of a fit."""
-
-    mutual: bool
-    first: str
-    second: str
-    tick: int
-    measured: MeasuredRange
-
-
-def joint_measurements(
-    facts: Facts, noise: Noise, period: float, reach: float = math.inf
-) -> JointMeasurements:
-    """Return the measurements in `facts`, with ticks of `period` s. No range above `reach` m is expected.
-
-    The path of a robot reaches to its first unknown manoeuvre; ranges after it are not used, nor those to
-    anchors of which no position is known.
-    """
-    places = {key.robot: value for key, value in facts.known if isinstance(value, AnchorPlace)}
-    starts = {key.robot: value for key, value in facts.known if isinstance(value, StartPose)}
-    steps: dict[str, list[Manoeuvre]] = {name: [] for name in facts.robots}
-    for key, value in facts.of_kind("manoeuvre"):
-        if isinstance(value, Manoeuvre) and key.tick == len(steps[key.robot]):
-            steps[key.robot].append(value)
-    rows = [
-        MeasuredRow(key.kind == "mutual range", key.robot, key.other, key.tick, value)
-        for key, value in facts.ordered
-        if isinstance(value, MeasuredRange)
-    ]
-    return of_rows(places, starts, steps, rows, noise, period, reach)
-
-
-def of_rows(
-    places: Mapping[str, AnchorPlace],
-    starts: Mapping[str, StartPose],
-    steps: Mapping[str, Sequence[Manoeuvre]],
-    measured: Iterable[MeasuredRow],
-    noise: Noise,
-    period: float,
-    reach: float,
-) -> JointMeasurements:
-    """Return what was `measured` by robots whose manoeuvres from tick 0 on are in `steps`.
-
-    `places` are those of the anchors, and `starts` those of the robots that have one.
-    """
-    surveyed, robots = {name: one for name, one in places.items() if not one.sigma}, sorted(steps)
-    rows = [
-        row
-        for row in measured
-        if row.tick <= len(steps[row.first])
-        and (row.tick <= len(steps[row.second]) if row.mutual else row.second in places)
-    ]
-    rows.sort(key=lambda row: row[:4])
-    used = tuple(sorted({row.second for row in rows if not row.mutual}))
-    unsure = [one for one in used if one not in surveyed]
-    unsure.sort(key=lambda name: places[name].sigma < math.inf)
-    index = {name: number for number, name in enumerate((*robots, *unsure))}
-    radios = tuple(dict.fromkeys([(row.first, row.second) for row in rows]))
-    radio = {names: number for number, names in enumerate(radios)}
-    first = sorted(used, key=lambda name: places[name].sigma)[:1]
-    origin = places[first[0]] if first else AnchorPlace(0.0, 0.0)
-    at = [surveyed.get(row.second, origin) for row in rows]
-    standing = [Manoeuvre(0.0, 0.0)] * max(map(len, steps.values()), default=0)
-    relative = [
-        one and one._replace(x=one.x - origin.x, y=one.y - origin.y)
-        for one in (*map(starts.get, robots), *map(places.get, unsure))
-    ]
-    anchors = tuple([one if isinstance(one, AnchorPlace) else None for one in relative]) if unsure else ()
-    return JointMeasurements(
-        tuple(index),
-        used,
-        radios,
-        tuple([_path(steps.get(name, standing), period) for name in index]),
-        JointRanges(
-            np.array([row.measured.range for row in rows], np.float64),
-            np.array([row.tick for row in rows], np.intp),
-            np.maximum(np.array([row.measured.sigma for row in rows], np.float64), SIGMA_FLOOR),
-            np.array([index[row.first] for row in rows], np.intp),
-            np.array([index.get(row.second, -1) for row in rows], np.intp),
-            np.array([(one.x - origin.x, one.y - origin.y) for one in at], np.float64).reshape(-1, 2),
-            np.array([radio[row.first, row.second] for row in rows], np.intp),
-        ),
-        period,
-        (origin.x, origin.y),
-        noise,
-        _prior(relative, OF_START * max(noise.anchor_sigma, noise.mutual_sigma, SIGMA_FLOOR)),
-        anchors,
-        reach,
-    )
-
-
-def _prior(poses: Sequence[AnchorPlace | StartPose | None], of_start: float) -> PosePrior | None:
-    """Return what is known of the poses of robots and anchors; None if nothing is.
-
-    The heading of an anchor means nothing, and is held. `of_start` is the sigma (m, rad) of a start.
-    """
-    if not any(poses):
-        return None
-    mean, information = np.zeros((len(poses), 3)), np.zeros((3 * len(poses), 3 * len(poses)))
-    for k, one in enumerate(poses):
-        told = None
-        match one:
-            case AnchorPlace(x, y, sigma):
-                mean[k, :2], told = (x, y), (sigma**-2, sigma**-2, 1.0)
-            case StartPose():
-                mean[k], told = one, (of_start**-2, of_start**-2, of_start**-2)
-        if told is not None:
-            information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.diag(told)
-    return prior_of(mean, information)
-
-
-def _path(steps: Sequence[Manoeuvre], period: float) -> Track:
-    """Return the path of `steps`; without slip or extra variances if all of them are 0."""
-    v, omega, slip, *extra = np.array(steps, np.float64).reshape(-1, 5).T
-    path = track(v + 0.0, omega + 0.0, period, slip if slip.any() else None)
-    both = np.stack(extra)
-    return path._replace(extra=both) if both.any() else path

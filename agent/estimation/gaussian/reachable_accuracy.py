@@ -18,7 +18,8 @@ from msgspec.structs import replace
 from agent.estimation.elementary import hypot
 from agent.estimation.fit import Start, deviation, fits
 from agent.estimation.gauss_newton import Convergence
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, near_anchors
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,

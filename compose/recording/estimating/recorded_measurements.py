@@ -24,7 +24,8 @@ from agent.estimation.facts import (
     mutual_range,
     start_pose,
 )
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, joint_measurements
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from compose.errors import BadRecording, NoEstimate, UserError

@@ -1,0 +1,316 @@
+"""What a robot of a team does next, by what it knows.
+
+It drives a loop until it is located. If it has ranges to one anchor only, it drives past the nearest other
+one on a circle about the first. Then it drives to where its next ranges are expected to tell most, until it
+can claim its pose.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.following import Following
+from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.measured_rows import near_anchors
+from agent.estimation.gaussian.odometry_noise import Array, track
+from agent.estimation.gaussian.search import of_anchor
+from agent.estimation.posterior import Hypothesis
+from agent.planning.active_sensing import AmongBeacons, plan_among
+from agent.planning.drive import pursuit, towards
+from agent.planning.strides import stride
+from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
+from protocol.messages import Undecided
+from protocol.motion import TAU, Controls, Pose
+from protocol.orbits import Orbit
+from protocol.sweep_ticks import sweep_speed
+from protocol.team_motion import loop, loop_ticks, nearest_other, spiral, way_past
+
+ARRIVED = 0.01
+"""The distance from a place, as a fraction of A_0, and the error (rad) of the way, at which it is there."""
+
+LOOPS_UNTIL_RETURN = 3
+"""The time, in loops, for which a robot drives to where it expects a range before it returns."""
+
+MANY_RETURNS = 2
+"""The number of returns to a contact after which what the robot does there has led away too often.
+
+With less, missions in which the next ranges would suffice take longer by these loops.
+"""
+
+LAPS = (0.0, 0.5, -0.5, 1.0, -1.0)
+"""The distances by which consecutive laps of the way past an anchor lie outside it, in units of R."""
+
+
+def next_task(state: TeamState) -> TeamState:
+    """Return `state` with the task and the controls of the next tick: the first that has a reason."""
+    for task in (_at_rest, _searching, _looping, _joining, _returning):
+        if (after := task(state)) is not None:
+            return after
+    state = _arrived(state)
+    for task in (_as_beacon, _surveying, _passing):
+        if (after := task(state)) is not None:
+            return after
+    return _circling(state)
+
+
+# --- with a verdict, or alone ---------------------------------------------------------------------------
+
+
+def _at_rest(state: TeamState) -> TeamState | None:
+    """Return `state` at rest at the end: it is undecided, or nobody waits for a result."""
+    if isinstance(state.verdict, Undecided):
+        return state.doing_next("undecided", 3, None)
+    return state.doing_next("localised", 3, None) if state.verdict and not state.waiting else None
+
+
+def _as_beacon(state: TeamState) -> TeamState | None:
+    """Return `state` with a claim: in loops while a robot in contact has no result. The origin goes on."""
+    if state.verdict is None or state.config.robot == state.team.origin:
+        return None
+    controls = loop(state.config.mission, state.own, state.tick) if state.waiting_here else None
+    return state.doing_next("localised", 3, controls)
+
+
+def _searching(state: TeamState) -> TeamState | None:
+    """Return `state` on the spiral, on which the first robot searches; the others stand.
+
+    It searches if nothing connects it with a robot that has no result. After a meeting, it goes on where it
+    has left the spiral.
+    """
+    if not (state.team.diameter and state.waiting and _alone(state)):
+        return None
+    if state.config.robot != state.team.origin:
+        return state.doing_next("waiting", 1, None)
+    mission, here, (corner, place) = state.config.mission, state.odometry, state.spiral
+    corners, v = spiral(mission, state.team.diameter), sweep_speed(mission)
+    if math.hypot(here.x - place[0], here.y - place[1]) <= (1.0 + ARRIVED) * v * mission.period:
+        place = here.x, here.y
+    for k in (corner, corner + 1):
+        at = corners[k % len(corners)] if place == (here.x, here.y) else place
+        way = towards(at, here, mission, ARRIVED)
+        if way is not None:
+            break
+    controls = Controls(min(way.v, v), way.omega) if way is not None else None
+    return replace(state, spiral=Spiral(k, place)).doing_next("searching", 2, controls)
+
+
+def _alone(state: TeamState) -> bool:
+    """Return whether nothing connects this robot with the first, or the first with one that is waiting."""
+    first = state.team.robots.index(state.team.origin or "")
+    others = state.waiting if first == state.own else [first]
+    return not any(state.log.logs[one] or state.nearest[one].range < math.inf for one in others)
+
+
+# --- to where it was in range ---------------------------------------------------------------------------
+
+
+def _joining(state: TeamState) -> TeamState | None:
+    """Return `state`, in a team without anchors, on its way to a robot that has no result."""
+    lost = [state.nearest[one].place for one in state.waiting if state.nearest[one].range < math.inf]
+    if state.team.origin is None or not lost or state.waiting_here or (not state.verdict and state.peers):
+        return None
+    return _homing(state, lost[0])
+
+
+def _returning(state: TeamState) -> TeamState | None:
+    """Return `state` on its way back if it is not where it seemed to be: its estimate begins again."""
+    place = _lost(state) if state.verdict is None else None
+    return replace(_homing(state, place), following=Following()) if place is not None else None
+
+
+def _homing(state: TeamState, place: Pose) -> TeamState:
+    way = towards((place.x, place.y), state.odometry, state.config.mission, ARRIVED)
+    return state.doing_next("homing", 1, way)
+
+
+def _arrived(state: TeamState) -> TeamState:
+    """Return `state`, after it has returned as often as MANY_RETURNS for two loops."""
+    if state.doing != "homing":
+        return state
+    loops = 2 * loop_ticks(state.config.mission, state.own)
+    until = state.tick + loops if state.returns >= MANY_RETURNS else -1
+    return replace(state, returns=state.returns + 1, loops_until=until)
+
+
+def _lost(state: TeamState) -> Pose | None:
+    """Return the place to which the robot returns if it is not where it seemed to be; None if that is open.
+
+    It has had no range for a few loops to what determines the frame: an anchor, or the robot whose start is
+    the origin. If it has never had one, others bring it: it returns to where it had the latest range to one.
+    """
+    team = state.team
+    beacon = state.anchored if team.origin is None else state.nearest[team.robots.index(team.origin)]
+    if team.origin is not None and beacon.range == math.inf:
+        beacon = max(state.nearest, key=lambda one: (one.range < math.inf, one.latest))
+    if beacon.range == math.inf or state.config.robot == team.origin:
+        return None
+    waits = LOOPS_UNTIL_RETURN * loop_ticks(state.config.mission, state.own) if state.doing != "homing" else 0
+    if state.tick <= beacon.latest + waits or (state.place is None and state.doing != "homing"):
+        return None
+    return beacon.place
+
+
+# --- before it is located -------------------------------------------------------------------------------
+
+
+def _circling(state: TeamState) -> TeamState:
+    return state.doing_next("circling", 1, loop(state.config.mission, state.own, state.tick))
+
+
+def _looping(state: TeamState) -> TeamState | None:
+    """Return `state` in the loops after MANY_RETURNS."""
+    return _circling(state) if state.tick < state.loops_until else None
+
+
+def _passing(state: TeamState) -> TeamState | None:
+    """Return `state` on the way past another anchor, once there is one."""
+    way = _way(state)
+    return replace(state, way=way).doing_next("orbiting", 2, _along(state, way)) if way is not None else None
+
+
+def _way(state: TeamState) -> Way | None:
+    """Return the way past the next anchor, once a loop has ranges to one with a position alone.
+
+    While there are ranges to that anchor, its place is estimated again.
+    """
+    mission, anchors = state.config.mission, state.team.anchors
+    entries, rooms = state.log.logs[state.own], dict[int, list[tuple[int, float]]]()
+    for tick, entry in enumerate(entries):
+        for one in entry.anchors:
+            if anchors[one.to].position is not None:
+                rooms.setdefault(one.to, []).append((tick, one.range))
+    if len(entries) <= loop_ticks(mission, state.own) or not rooms:
+        return state.way
+    first = max(rooms, key=lambda anchor: (len(rooms[anchor]), -anchor))
+    known = [one for one in anchors if one.id in state.config.ranges]
+    distance = nearest_other(anchors[first], known)
+    if distance is None or (state.way is not None and rooms[first][-1][0] < state.tick):
+        return state.way
+    driven = [one.executed for one in entries if one.executed is not None]
+    v, omega = (np.array([getattr(one, name) for one in driven]) + 0.0 for name in ("v", "omega"))
+    path = track(v, omega, mission.period)
+    alone = near_anchors((path,), (rooms[first],), ((0.0, 0.0),), mission.noise, mission.sensing_range)
+    found = of_anchor((), alone.alone(0))
+    if not found:
+        return state.way
+    start = found[0].fit.start.poses[0].tolist()
+    orbit = way_past(mission, distance)
+    since = state.tick if state.way is None else state.way.since
+    return Way(Pose(-start[0], -start[1], 0.0), orbit, since)
+
+
+def _along(state: TeamState, way: Way) -> Controls:
+    """Return the controls that lead to the way and along it. Each lap is aside of the last one."""
+    mission, orbit = state.config.mission, way.orbit
+    lap = int((state.tick - way.since) * mission.period * orbit.omega / (1.25 * TAU))
+    radius = max(orbit.radius + LAPS[lap % len(LAPS)] * mission.sensing_range, 0.3 * mission.sensing_range)
+    omega = min(mission.max_turn_rate, mission.max_speed / radius)
+    local = Pose(state.odometry.x - way.centre.x, state.odometry.y - way.centre.y, state.odometry.heading)
+    return pursuit(local, Orbit(radius, omega * radius, omega), mission)
+
+
+# --- to where ranges tell most ---------------------------------------------------------------------------
+
+
+def _surveying(state: TeamState) -> TeamState | None:
+    """Return `state` on the way to where the next ranges are expected to tell most; None if that is open."""
+    mission, seen = state.config.mission, _seen(state)
+    if not seen or not len(seen[0].beacons):
+        return None
+    if state.doing == "surveying" and state.tick < state.planned + stride(mission):
+        return state
+    sigma = max(mission.noise.anchor_sigma, mission.noise.mutual_sigma)
+    controls = plan_among(seen, sigma, mission, _frame_sigma(state))
+    return replace(state, planned=state.tick).doing_next("surveying", 3, controls)
+
+
+def _seen(state: TeamState) -> list[AmongBeacons]:
+    """Return the hypotheses that the next ranges have to distinguish; none if this robot is not located.
+
+    The robot whose start is the origin knows where it is. It moves so that the others get to know it: what
+    counts is the place of the least accurate of them as seen from it, and all hypotheses about them. So it is
+    with an anchor that is wanted.
+    """
+    place, known = state.place, state.following.known.hypotheses
+    if place is None:
+        return []
+    part = state.following.part
+    assert part is not None
+    wanted = [part.robots.index(one) for one in state.wanted[:1] if one in part.robots]
+    if state.config.robot == state.team.origin:
+        wanted = [k for k in range(len(part.robots)) if k != place]
+        if not wanted:
+            return []
+    chosen = [LikelyPose(one.probability, one) for one in known] if wanted else state.poses
+    total = math.fsum([one.probability for one in chosen])
+    return [
+        AmongBeacons(
+            PlanningHypothesis(
+                one.probability / total,
+                one.hypothesis.fit.poses[place],
+                _as_seen(one.hypothesis, place, wanted) if wanted else _own_covariance(one, place),
+            ),
+            *_beacons(state, one.hypothesis, wanted if state.wanted else ()),
+        )
+        for one in chosen
+    ]
+
+
+def _own_covariance(pose: LikelyPose, place: int) -> Array:
+    own = slice(3 * place, 3 * place + 3)
+    return pose.hypothesis.fit.covariance[own, own]
+
+
+def _as_seen(hypothesis: Hypothesis, place: int, wanted: Sequence[int]) -> Array:
+    """Return the covariance of a pose, its position relative to the least accurate of those wanted."""
+    joint, own = hypothesis.fit.covariance, slice(3 * place, 3 * place + 2)
+    found = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3].copy()
+    places = [slice(3 * k, 3 * k + 2) for k in wanted]
+    away = [joint[own, own] + joint[k, k] - joint[own, k] - joint[k, own] for k in places]
+    found[:2, :2] = max(away, key=lambda one: float(np.trace(one)))
+    return found
+
+
+def _frame_sigma(state: TeamState) -> float:
+    """Return the sigma (rad) of the heading of the robot whose start is the origin; 0 with anchors."""
+    part, origin = state.following.part, state.team.origin
+    if origin is None or part is None:
+        return 0.0
+    fit, i = state.following.known.hypotheses[0].fit, 3 * part.robots.index(origin) + 2
+    return math.sqrt(max(float(fit.covariance[i, i]), 0.0))
+
+
+def _beacons(state: TeamState, hypothesis: Hypothesis, wanted: Sequence[int]) -> tuple[Array, Array]:
+    """Return the places (m) of the anchors and robots that the robot may range, and of those to stay near.
+
+    Without anchors, it stays near the robot whose start is the origin. A robot that has ranged one anchor
+    only goes to another one. If an anchor is `wanted`, it counts alone.
+    """
+    part = state.following.part
+    assert part is not None
+    if wanted:
+        there = hypothesis.fit.poses[list(wanted), :2]
+        return there, there
+    config, origin = state.config, part.origin
+    known = {
+        one.id: (one.position.x - origin[0], one.position.y - origin[1])
+        for one in state.team.anchors
+        if one.position is not None and one.id in config.ranges
+    }
+    found, gone, first = list(known.values()), [], None
+    ranged = {state.team.anchors[one.to].id for entry in state.log.logs[state.own] for one in entry.anchors}
+    if others := [place for name, place in known.items() if len(ranged) == 1 and name not in ranged]:
+        first = np.array(others)
+    for name, (x, y, _) in zip(part.robots, hypothesis.fit.poses.tolist(), strict=True):
+        if name in config.ranges or name in state.peers:
+            found.append((x, y))
+        elif name in state.team.robots and name != config.robot:
+            gone.append((x, y))  # it may have left that place
+        if name == state.team.origin and name != config.robot:
+            first = np.array([(x, y)])
+    places = np.array(found or gone, np.float64).reshape(-1, 2)
+    return places, places if first is None else first
