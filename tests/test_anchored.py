@@ -119,6 +119,18 @@ def test_a_straight_way_leaves_the_mirror_image_at_two_anchors() -> None:
     assert "the most probable of 2 hypotheses has probability" in found.summary.blocking_reason
 
 
+@pytest.mark.parametrize(("count", "unverified"), [(2, ["M0", "M1"]), (4, [])])
+def test_an_anchor_of_which_no_range_tells_whether_it_is_off_its_survey_is_named(
+    count: int, unverified: list[str]
+) -> None:
+    problem = measurements(driven(ANCHORS[:count], sigma=0.02), None, "uwb-calibrated", None)
+    found = estimated(problem, ClaimRule(0.5))
+    assert found.summary.doubtful_anchors == {}
+    assert sorted(found.summary.unverified_anchors) == unverified
+    for why in found.summary.unverified_anchors.values():
+        assert why.startswith("no range tells whether it stands 0.5 m off along (")
+
+
 def test_one_place_is_not_enough() -> None:
     twice = (ANCHORS[0], ANCHORS[0]._replace(id="M9"))
     with pytest.raises(UserError, match=r"ranges to two anchors at different places: A has ranges to M0, M9"):

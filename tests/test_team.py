@@ -128,6 +128,12 @@ def test_an_anchor_off_its_survey_is_named_before_its_ranges_pass_as_strays() ->
     assert any("anchor A1 seems to stand elsewhere" in (one.text or "") for one in run.end.causes)
 
 
+def test_an_anchor_with_three_ranges_from_one_line_is_not_said_to_stand_at_their_mirror_image() -> None:
+    room = MISSION.replace("5.0", "3.0") + "[team]\nrobots = 2\nanchors = 5\nside = 10.0"
+    run = run_mission(replace(parse(f'name = "line"\nseed = 1021\n{room}', "line"), max_ticks=8))
+    assert run.standing_claim("r1") is not None
+
+
 APART = '[[robot]]\nid = "a"\nstart = [1.0, 1.0, 0.5]\n[[robot]]\nid = "b"\nstart = [9.0, 7.0, 2.0]'
 SCATTERED = team(APART, "", MISSION.replace("0.05", "0.0") + '\nframe = "relative"\ndiameter = 10.0')
 

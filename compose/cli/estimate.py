@@ -139,6 +139,7 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
         found.append(f"anchor {name}: {x:.2f} {y:.2f}, with a sigma of {anchor.sigma:.2f} m")
     for name, why in summary.doubtful_anchors.items():
         found.append(f"anchor {name} seems to stand elsewhere than surveyed: {why}")
+    found += [f"anchor {name}: {why}" for name, why in summary.unverified_anchors.items()]
     if summary.blocking_reason:
         found.append(f"no claim at the end: {summary.blocking_reason}")
     for why, count in summary.unused_ranges.items():

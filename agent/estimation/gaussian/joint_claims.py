@@ -3,33 +3,49 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
 from msgspec.structs import replace
 
+from agent.estimation.elementary import eigh, hypot
 from agent.estimation.facts import AnchorPlace
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, prior_of
-from agent.estimation.gaussian.odometry_noise import track
+from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.search import FEWEST_DECISIVE, OPEN, beacons, position_sigma
 
 
 class Displacement(NamedTuple):
-    """An anchor whose ranges favour another position than that which was told."""
+    """How far the ranges of an anchor favour another position than that which was told."""
 
     anchor: str
     vector: tuple[float, float]
     """The vector in m to the position that they favour."""
     sigmas: float
     """The length in sigmas."""
+    open_along: tuple[float, float]
+    """The direction, of length 1, in which they tell least about the position."""
+    open_sigma: float
+    """The standard deviation (m) of the position in this direction."""
 
     @property
     def what(self) -> str:
         """The words for it."""
         return f"by its ranges, {math.hypot(*self.vector):.2g} m from its position ({self.sigmas:.1f} sigmas)"
+
+    def unverified(self, displaced: float) -> str:
+        """Return a sentence if `displaced` m in that direction are less than DISPLACED_SIGMAS; else none."""
+        if DISPLACED_SIGMAS * self.open_sigma < displaced:
+            return ""
+        x, y = self.open_along
+        return (
+            f"no range tells whether it stands {displaced:.2g} m off along ({x:.2f}, {y:.2f}): its position "
+            f"has a sigma of {self.open_sigma:.2g} m in that direction"
+        )
 
 
 DISPLACED_SIGMAS = 4.0
@@ -39,30 +55,44 @@ Honest anchors of LIAS have at most 1.1 after 40 s, and one that is 0.6 m off ha
 """
 
 
-def displaced_anchor(fit: Fit, used: JointMeasurements) -> Displacement | None:
-    """Return the anchor that most seems to stand elsewhere; None if none does (Wald 1943).
+def displacements(fit: Fit, used: JointMeasurements) -> Iterator[Displacement]:
+    """Yield how far each anchor with a told position seems to stand elsewhere (Wald 1943).
 
     The position of each in turn is estimated as if it were not known: then its ranges are no strays, and do
-    not raise the noise level.
+    not raise the noise level. The length in sigmas is the lesser one by the covariance there and the misfit
+    at the told position: where a few ranges admit two places, that covariance is small, too.
     """
-    most = Displacement("", (0.0, 0.0), DISPLACED_SIGMAS)
     for name in used.anchors:
         measured, k, told = _estimating(name, used)
         if told.sigma == math.inf:
             continue
-        poses, place = fit.start.poses, np.array((told.x, told.y))
+        poses, place, own = fit.start.poses, np.array((told.x, told.y)), slice(3 * k, 3 * k + 2)
         starts = poses if k < len(poses) else np.vstack((poses, (*place, 0.0)))
         for free in fits(measured, [Start(starts, fit.start.errors)]):
-            own = slice(3 * k, 3 * k + 2)
             away = free.poses[k, :2] - place
-            spread = free.covariance[own, own] + told.sigma**2 * np.eye(2)
-            (xx, xy), (_, yy) = spread.tolist()
-            x, y = away.tolist()
-            square, area = yy * x * x - 2.0 * xy * x * y + xx * y * y, xx * yy - xy * xy
-            sigmas = math.sqrt(square / area) if min(square, area) > 0.0 else 0.0
-            if sigmas > most.sigmas and free.last_step <= FINISHED:
-                most = Displacement(name, (x, y), sigmas)
-    return most if most.anchor else None
+            variances, axes = eigh(free.covariance[own, own] + told.sigma**2 * np.eye(2))
+            (x, y), along = away.tolist(), tuple(axes[:, 1].tolist())
+            if free.last_step > FINISHED or not variances[0] > 0.0:
+                yield Displacement(name, (x, y), 0.0, along, math.inf)
+                continue
+            square = float(np.sum(np.square(axes.T @ away) / variances))
+            sigmas = math.sqrt(max(min(square, _worse_at(place, k, free, measured)), 0.0))
+            yield Displacement(name, (x, y), sigmas, along, math.sqrt(float(variances[1])))
+
+
+def _worse_at(place: Array, k: int, fit: Fit, measured: JointMeasurements) -> float:
+    """Return by how many squared sigmas ranges of anchor `k` fit worse at `place`, on the same paths."""
+    rows = measured.ranges.rows(measured.ranges.second == k)
+    residual, at = fit.residuals[measured.ranges.second == k], fit.paths[rows.first, rows.tick, :2]
+    shorter = hypot(*(at - fit.poses[k, :2]).T) - hypot(*(at - place).T)
+    worse = np.square(residual + shorter) - np.square(residual)
+    return float(np.sum(worse / np.square(rows.sigma))) / fit.level
+
+
+def displaced_anchor(fit: Fit, used: JointMeasurements) -> Displacement | None:
+    """Return the anchor that most seems to stand elsewhere; None if none does."""
+    found = max(displacements(fit, used), key=lambda one: one.sigmas, default=None)
+    return found if found is not None and found.sigmas > DISPLACED_SIGMAS else None
 
 
 def _estimating(name: str, used: JointMeasurements) -> tuple[JointMeasurements, int, AnchorPlace]:

@@ -11,7 +11,7 @@ import numpy as np
 
 from agent.estimation.fit import Fit
 from agent.estimation.following import ClaimRule
-from agent.estimation.gaussian.joint_claims import displaced_anchor
+from agent.estimation.gaussian.joint_claims import DISPLACED_SIGMAS, Displacement, displacements
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER
 from compose.recording.estimating.estimate_rows import (
@@ -45,6 +45,7 @@ def summary_of(measured: Measurements, epochs: Sequence[EstimateEpoch], rule: Cl
         claims = dict.fromkeys(claims, False)
     standing = _standing([name for name, claim in claims.items() if not claim], measured)
     counts = dict(zip(pairs, last.ranges, strict=True))
+    displaced = list(displacements(*last.fitted)) if last.fitted is not None else []
     return EstimateSummary(
         measured.source,
         measured.noise,
@@ -62,7 +63,8 @@ def summary_of(measured: Measurements, epochs: Sequence[EstimateEpoch], rule: Cl
         measured.doubt or standing or last.blocking_reason,
         last.undetermined,
         dict(_anchors(*last.fitted, measured)) if last.fitted is not None else {},
-        _doubtful(*last.fitted) if last.fitted is not None else {},
+        _doubtful(*last.fitted, displaced) if last.fitted is not None else {},
+        {one.anchor: why for one in displaced if (why := one.unverified(rule.accuracy))},
     )
 
 
@@ -131,10 +133,10 @@ def _anchors(
         yield name, EstimatedAnchor((x, y), ((xx, xy), (xy, yy)), place, sigma, one.height)
 
 
-def _doubtful(fit: Fit, used: JointMeasurements) -> dict[str, str]:
+def _doubtful(fit: Fit, used: JointMeasurements, displaced: Sequence[Displacement]) -> dict[str, str]:
     """Return why anchors seem to stand elsewhere: by a test, or since most of their ranges fit no other."""
-    displaced = displaced_anchor(fit, used)
-    doubtful = {displaced.anchor: displaced.what} if displaced is not None else {}
+    most = max(displaced, key=lambda one: one.sigmas, default=None)
+    doubtful = {most.anchor: most.what} if most is not None and most.sigmas > DISPLACED_SIGMAS else {}
     anchors = np.array([pair[1] for pair in used.radios])[used.ranges.radio]
     for name in dict.fromkeys(anchors[np.isin(anchors, used.anchors)].tolist()):
         strays = fit.weights[anchors == name] <= INLIER
