@@ -78,7 +78,7 @@ def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -
     told = summary(out)
     assert list(told) == [
         *("scenario", "seed", "mode", "outcome", "reason", "ticks", "wall_s", "first_contact_tick"),
-        *("t_max_s", "min_separation_m", "parameters", "versions", "robots"),
+        *("t_max_s", "min_separation_m", "nearest_m", "parameters", "versions", "robots"),
     ]
     assert (told["scenario"], told["seed"], told["mode"]) == (name, 1, "processes")
     assert 0.0 < told["wall_s"] < 60.0

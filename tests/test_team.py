@@ -162,6 +162,17 @@ def _distance(place: complex, begin: complex, end: complex) -> float:
     return abs(place - begin - min(max(along, 0.0), 1.0) * (end - begin))
 
 
+@pytest.mark.parametrize("frame", series(["", 'frame = "relative"\n'], 1))
+def test_robots_of_a_team_keep_the_safety_distance(frame: str) -> None:
+    drawn = "[team]\nrobots = 4\nside = 4.0\n" + ("" if frame else "anchors = 2\n")
+    text = f'name = "apart"\nseed = 2\n{MISSION}safety_distance = 0.6\n{frame}{drawn}'
+    run = of_frames(kept(parse(text, "apart")))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert audit_run(run).violations == ()
+    assert summary(run, None, None)["nearest_m"] >= 0.6
+
+
 KILLS = ("a@2 world@4", "", "b@1:command b@3:report world@0")
 EACH_KILLED = [(SHIPPED[i % 2], kills) for i, kills in enumerate(KILLS[:2])]
 EACH_KILLED += [(name, kills) for name in SHIPPED for kills in KILLS if (name, kills) not in EACH_KILLED]
@@ -384,6 +395,18 @@ DRAWN = "[team]\nrobots = 2\nside = 4.0\nanchors = 3\n"
         ({"robots": ALONE + '\nanchors = ["A1", "B2"]'}, "robot[0].anchors: there is no anchor 'B2'"),
         ({"robots": ALONE + '\nanchors = ["A1"]'}, "robot[0]: 'a' may range fewer than two anchors"),
         ({"robots": TWO, "mission": RELATIVE}, "mission.frame: anchors determine the frame"),
+        (
+            {"robots": TWO, "mission": MISSION + "safety_distance = 0.5"},
+            "robot[1].start: nearer to another one than 1.65 m",
+        ),
+        (
+            {
+                "robots": APART,
+                "anchors": "",
+                "mission": RELATIVE.replace("0.05}", "0.05, gyro_bias = 0.01}") + "diameter = 10.0",
+            },
+            "mission.noise.gyro_bias: within the",
+        ),
         ({"robots": ALONE, "anchors": "", "mission": RELATIVE}, "mission.frame: the poses of at least two"),
         ({"robots": ALONE, "mission": MISSION + "diameter = 9.0"}, "mission.diameter: it is for robots with"),
         (

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
 from agent.peer.false_reports import falsified_entries
 from agent.peer.team_log import TeamLog, TeamReport
@@ -23,7 +23,7 @@ from agent.planning.team_state import (
     in_world,
     located_anchors,
 )
-from agent.planning.team_tasks import next_task
+from agent.planning.team_tasks import next_task, safe_controls
 from protocol.messages import Command, Estimate, Localised, Observation, RobotConfig
 from protocol.motion import REST, step
 
@@ -47,17 +47,21 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         if driven is not None:
             odometry = step(odometry, driven.v, driven.omega, period)
         ranges = {one.peer: one.range for one in observation.contacts if one.range is not None}
-        nearest = zip(state.team.robots, state.nearest, strict=True)
+        each = zip(state.team.robots, state.nearest, strict=True)
+        nearest = [one.ranged(ranges.get(robot), odometry, observation.tick) for robot, one in each]
         anchor = min([one.range for one in observation.anchors], default=None)
         return replace(
             state,
             tick=observation.tick,
             odometry=odometry,
             log=state.log.measured(state.own, observation, state.team),
-            peers=tuple([one.peer for one in observation.contacts]),
-            nearest=tuple(
-                [one.ranged(ranges.get(robot), odometry, observation.tick) for robot, one in nearest]
-            ),
+            apart={
+                one.peer: one.range
+                if one.range is not None
+                else max(0.0, state.apart.get(one.peer, 0.0) - 2.0 * state.config.mission.first_straight)
+                for one in observation.contacts
+            },
+            nearest=tuple(nearest),
             anchored=state.anchored.ranged(anchor, odometry, observation.tick),
         )
 
@@ -86,7 +90,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
     def command(self, state: TeamState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
         robot, rests = state.config.robot, state.verdict is not None and state.controls == REST
-        v, omega = state.controls.v, state.controls.omega
+        v, omega = astuple(safe_controls(state))
         return Command(
             state.tick, robot, v, omega, state.phase, state.doing, verdict=state.verdict, rests=rests
         )
@@ -124,6 +128,6 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
             anchor_ranges=sum([len(one.anchors) for one in entries]),
             hypotheses=len(poses) or None,
             probability=min(poses[0].probability / total, 1.0) if noisy and poses else None,
-            blocking_reason=state.why_not or None if noisy and state.verdict is None else None,
+            blocking_reason=state.joint.why_not or None if noisy and state.verdict is None else None,
             p_value=p_value if noisy else None,
         )

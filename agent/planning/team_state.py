@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from itertools import combinations
 from typing import NamedTuple
 
@@ -17,6 +17,7 @@ from agent.estimation.gaussian.search import position_sigma
 from agent.estimation.posterior import Hypothesis, certainties, same
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import TeamLog
+from agent.planning.agenda import Bypass
 from protocol.messages import RobotConfig, SurveyedAnchor, Team, Undecided, Verdict
 from protocol.mission import Anchor
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, relative, wrap
@@ -93,22 +94,20 @@ class TeamState(msgspec.Struct, frozen=True):
     tick: int = -1
     odometry: Pose = ORIGIN
     """The pose by dead reckoning, in the frame of the pose at tick 0."""
-    peers: tuple[str, ...] = ()
-    """The robots that are in contact."""
+    apart: Mapping[str, float] = {}
+    """The distance (m) to each robot in contact: its range, or what the latest one admits at least."""
+    passing: Bypass = Bypass()
+    """The way past robots that are near, if the mission has a safety distance."""
     nearest: tuple[Near, ...] = ()
     """The place where the robot was nearest to each robot of the team."""
     anchored: Near = Near()
     """The place where the robot was nearest to an anchor."""
-    measured: TeamMeasurements = TeamMeasurements()
-    """The part of the log that the estimate has read."""
-    following: Following = Following()
-    """The estimate of all poses; in a team that tolerates false data, by the own measurements alone."""
+    joint: TeamEstimate = TeamEstimate(why_not="it has not moved yet")
+    """The estimate by all measurements; in a team that tolerates false data, by the own ones alone."""
     pairs: tuple[TeamEstimate, ...] = ()
     """The estimates by these and the measurements of each other robot, in such a team."""
     wanted: tuple[str, ...] = ()
     """The anchors that are not accurate enough yet, the least accurate one first."""
-    why_not: str = "it has not moved yet"
-    """The reason against a claim; empty if there is none."""
     verdict: Verdict | None = None
     way: Way | None = None
     """The way past an anchor; None until it has none."""
@@ -144,6 +143,11 @@ class TeamState(msgspec.Struct, frozen=True):
         return [one for one in range(len(self.team.robots)) if one not in {*self.log.done, self.own}]
 
     @property
+    def following(self) -> Following:
+        """The estimate of all poses."""
+        return self.joint.following
+
+    @property
     def place(self) -> int | None:
         """The index of this robot in the fits; None if it is not located."""
         part = self.following.part
@@ -163,7 +167,7 @@ class TeamState(msgspec.Struct, frozen=True):
     @property
     def waiting_here(self) -> bool:
         """True if another robot in contact has no result, as far as this one knows."""
-        return any(self.team.robots[one] in self.peers for one in self.waiting)
+        return any(self.team.robots[one] in self.apart for one in self.waiting)
 
     def doing_next(self, doing: str, phase: int, controls: Controls | None) -> TeamState:
         """Return this with another task, and its controls; None: it stands still."""
@@ -172,20 +176,16 @@ class TeamState(msgspec.Struct, frozen=True):
 
 def followed(state: TeamState) -> TeamState:
     """Return `state` with the estimate by all measurements so far."""
-    own = state.own
-    before = TeamEstimate(state.measured, state.following)
-    known = _estimated(state, before, (own,) if state.config.tolerates else None)
-    wanted, why_not = _wanted(known.following, state.team, state.config.mission.confidence), known.why_not
-    if wanted and not why_not:
-        why_not = f"anchor {wanted[0]} is not known to {state.team.survey:g} m yet"
-    pairs = tuple(
-        [
-            _estimated(state, pair, (own, k)) if k != own and state.log.logs[k] else pair
-            for k, pair in enumerate(state.pairs)
-        ]
-    )
-    measured, following = known.measured, known.following
-    return replace(state, measured=measured, following=following, why_not=why_not, wanted=wanted, pairs=pairs)
+    own, logs = state.own, state.log.logs
+    joint = _estimated(state, state.joint, (own,) if state.config.tolerates else None)
+    wanted = _wanted(joint.following, state.team, state.config.mission.confidence)
+    if wanted and not joint.why_not:
+        joint = joint._replace(why_not=f"anchor {wanted[0]} is not known to {state.team.survey:g} m yet")
+    pairs = [
+        _estimated(state, pair, (own, k)) if k != own and logs[k] else pair
+        for k, pair in enumerate(state.pairs)
+    ]
+    return replace(state, joint=joint, wanted=wanted, pairs=tuple(pairs))
 
 
 def _estimated(state: TeamState, before: TeamEstimate, of: Collection[int] | None) -> TeamEstimate:
@@ -224,15 +224,15 @@ def _wanted(following: Following, team: Team, confidence: float) -> tuple[str, .
 
 def claimed(state: TeamState) -> TeamState:
     """Return `state` with a verdict, if there is one now."""
-    if not state.why_not:
+    if not state.joint.why_not:
         return _with_verdict(state, state.following.judged[state.config.robot].localised)
     claiming = [pair.following for pair in state.pairs if not pair.why_not]
     for agreed in combinations(claiming, state.config.tolerates + 1):
         claim = united([one.judged[state.config.robot].localised for one in agreed], state.config.mission)
         if claim is not None:  # one of these robots is honest
-            return _with_verdict(replace(state, following=agreed[-1]), claim)
+            return _with_verdict(replace(state, joint=state.joint._replace(following=agreed[-1])), claim)
     if state.tick * state.config.mission.period >= state.config.gives_up:
-        return _with_verdict(state, Undecided(state.why_not))
+        return _with_verdict(state, Undecided(state.joint.why_not))
     return state
 
 
@@ -259,14 +259,6 @@ def located_anchors(state: TeamState) -> tuple[SurveyedAnchor, ...]:
     if part is None or not known:
         return ()
     fit, (x, y) = known[0].fit, part.origin
-    return tuple(
-        [
-            SurveyedAnchor(
-                name,
-                Anchor(float(x + fit.poses[k, 0]), float(y + fit.poses[k, 1])),
-                min(position_sigma(fit, k), MOST_SIGMA),
-            )
-            for k, name in enumerate(part.robots)
-            if part.is_anchor(k)
-        ]
-    )
+    places = [(k, *one) for k, one in enumerate((fit.poses[:, :2] + (x, y)).tolist()) if part.is_anchor(k)]
+    sigmas = {k: min(position_sigma(fit, k), MOST_SIGMA) for k, *_ in places}
+    return tuple([SurveyedAnchor(part.robots[k], Anchor(*at), sigmas[k]) for k, *at in places])

@@ -19,13 +19,17 @@ from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.posterior import Hypothesis
+from agent.planning import separation
 from agent.planning.active_sensing import AmongBeacons, plan_among
-from agent.planning.drive import pursuit, towards
+from agent.planning.drive import homing, pursuit, towards
 from agent.planning.strides import stride
+from agent.planning.tasks import Travelling
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
+from agent.planning.visit import passed
 from protocol.messages import Undecided
-from protocol.motion import TAU, Controls, Pose
+from protocol.motion import REST, TAU, Controls, Pose
 from protocol.orbits import Orbit
+from protocol.sweep_strips import Place
 from protocol.sweep_ticks import sweep_speed
 from protocol.team_motion import loop, loop_ticks, nearest_other, spiral, way_past
 
@@ -49,15 +53,39 @@ def next_task(state: TeamState) -> TeamState:
     """Return `state` with the task and the controls of the next tick: the first that has a reason."""
     for task in (_at_rest, _searching, _looping, _joining, _returning):
         if (after := task(state)) is not None:
-            return after
+            return _passing_robots(after)
     state = _arrived(state)
     for task in (_as_beacon, _surveying, _passing):
         if (after := task(state)) is not None:
-            return after
-    return _circling(state)
+            return _passing_robots(after)
+    return _passing_robots(_circling(state))
 
 
-# --- with a verdict, or alone ---------------------------------------------------------------------------
+def _passing_robots(state: TeamState) -> TeamState:
+    """Return `state` with the way that the safety distance leaves; if it is blocked, on a way aside."""
+    mission, here = state.config.mission, state.odometry
+    if not mission.safety_distance:
+        return state
+    ahead = Travelling((here.x + math.cos(here.heading), here.y + math.sin(here.heading)))
+    way = ahead if state.controls.v else None
+    free = [separation.SHARE_OF_EACH * separation.leeway(rho, mission) for rho in state.apart.values()]
+    passing = passed(state.passing, way, here, min(free, default=math.inf), mission)
+    if passing.places and _aside(passing.places, state) is None:
+        passing = replace(passing, places=passing.places[1:])
+    return replace(state, passing=passing)
+
+
+def safe_controls(state: TeamState) -> Controls:
+    """Return the controls of the task, or aside of it, at a speed that keeps the safety distance."""
+    controls, passing = state.controls, state.passing
+    if passing.places:
+        controls = _aside(passing.places, state) or REST
+    most = passing.leeway / state.config.mission.period
+    return Controls(min(max(controls.v, -most), most), controls.omega)
+
+
+def _aside(places: Sequence[Place], state: TeamState) -> Controls | None:
+    return homing(Pose(*places[0], 0.0), state.odometry, state.config.mission, ARRIVED)
 
 
 def _at_rest(state: TeamState) -> TeamState | None:
@@ -105,13 +133,10 @@ def _alone(state: TeamState) -> bool:
     return not any(state.log.logs[one] or state.nearest[one].range < math.inf for one in others)
 
 
-# --- to where it was in range ---------------------------------------------------------------------------
-
-
 def _joining(state: TeamState) -> TeamState | None:
     """Return `state`, in a team without anchors, on its way to a robot that has no result."""
     lost = [state.nearest[one].place for one in state.waiting if state.nearest[one].range < math.inf]
-    if state.team.origin is None or not lost or state.waiting_here or (not state.verdict and state.peers):
+    if state.team.origin is None or not lost or state.waiting_here or (not state.verdict and state.apart):
         return None
     return _homing(state, lost[0])
 
@@ -119,7 +144,9 @@ def _joining(state: TeamState) -> TeamState | None:
 def _returning(state: TeamState) -> TeamState | None:
     """Return `state` on its way back if it is not where it seemed to be: its estimate begins again."""
     place = _lost(state) if state.verdict is None else None
-    return replace(_homing(state, place), following=Following()) if place is not None else None
+    if place is None:
+        return None
+    return replace(_homing(state, place), joint=state.joint._replace(following=Following()))
 
 
 def _homing(state: TeamState, place: Pose) -> TeamState:
@@ -152,9 +179,6 @@ def _lost(state: TeamState) -> Pose | None:
     if state.tick <= beacon.latest + waits or (state.place is None and state.doing != "homing"):
         return None
     return beacon.place
-
-
-# --- before it is located -------------------------------------------------------------------------------
 
 
 def _circling(state: TeamState) -> TeamState:
@@ -213,9 +237,6 @@ def _along(state: TeamState, way: Way) -> Controls:
     return pursuit(local, Orbit(radius, omega * radius, omega), mission)
 
 
-# --- to where ranges tell most ---------------------------------------------------------------------------
-
-
 def _surveying(state: TeamState) -> TeamState | None:
     """Return `state` on the way to where the next ranges are expected to tell most; None if that is open."""
     mission, seen = state.config.mission, _seen(state)
@@ -252,7 +273,7 @@ def _seen(state: TeamState) -> list[AmongBeacons]:
             PlanningHypothesis(
                 one.probability / total,
                 one.hypothesis.fit.poses[place],
-                _as_seen(one.hypothesis, place, wanted) if wanted else _own_covariance(one, place),
+                _as_seen(one.hypothesis, place, wanted),
             ),
             *_beacons(state, one.hypothesis, wanted if state.wanted else ()),
         )
@@ -260,18 +281,13 @@ def _seen(state: TeamState) -> list[AmongBeacons]:
     ]
 
 
-def _own_covariance(pose: LikelyPose, place: int) -> Array:
-    own = slice(3 * place, 3 * place + 3)
-    return pose.hypothesis.fit.covariance[own, own]
-
-
 def _as_seen(hypothesis: Hypothesis, place: int, wanted: Sequence[int]) -> Array:
-    """Return the covariance of a pose, its position relative to the least accurate of those wanted."""
+    """Return the covariance of a pose, its position relative to the least accurate one that is wanted."""
     joint, own = hypothesis.fit.covariance, slice(3 * place, 3 * place + 2)
     found = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3].copy()
     places = [slice(3 * k, 3 * k + 2) for k in wanted]
     away = [joint[own, own] + joint[k, k] - joint[own, k] - joint[k, own] for k in places]
-    found[:2, :2] = max(away, key=lambda one: float(np.trace(one)))
+    found[:2, :2] = max(away, key=lambda one: float(np.trace(one)), default=found[:2, :2])
     return found
 
 
@@ -306,7 +322,7 @@ def _beacons(state: TeamState, hypothesis: Hypothesis, wanted: Sequence[int]) ->
     if others := [place for name, place in known.items() if len(ranged) == 1 and name not in ranged]:
         first = np.array(others)
     for name, (x, y, _) in zip(part.robots, hypothesis.fit.poses.tolist(), strict=True):
-        if name in config.ranges or name in state.peers:
+        if name in config.ranges or name in state.apart:
             found.append((x, y))
         elif name in state.team.robots and name != config.robot:
             gone.append((x, y))  # it may have left that place

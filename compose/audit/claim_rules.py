@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
+from itertools import combinations
 from typing import Any
 
 from agent.estimation.judged import sufficient_mutual_ranges
@@ -11,12 +13,16 @@ from agent.planning.planner import Planner
 from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
+from compose.recording.closest_approach import nearest
 from compose.recording.reasons import of_it, reason_for
 from compose.recording.run import Run
 from protocol.messages import MissionEnd, Report
 from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
 from world.scenario import RobotSpec
+
+TOUCHING = 1e-9
+"""The part of the safety distance by which rounding may bring two robots nearer."""
 
 
 def claim(run: Run) -> Checks:
@@ -36,6 +42,31 @@ def claim(run: Run) -> Checks:
         if agent is not None and tick < len(agent.steps) and agent.steps[tick].command is not None:
             yield _redundant(run, placed, agent, tick)
     yield from outcome(run)
+
+
+def distance(run: Run) -> Checks:
+    """Check that no two robots came nearer than the safety distance, nor than they began."""
+    least = run.scenario.mission.safety_distance
+    if not least or (found := nearest(run)) is None:
+        return
+    begun = [
+        math.dist((one.x, one.y), (two.x, two.y)) for one, two in combinations(run.ticks[0].truth.poses, 2)
+    ]
+    least = min([least, *begun])
+    what = f"two robots came {found:.6g} m near, expected at least {least:.6g} m"
+    near = found < least * (1.0 - TOUCHING)
+    yield Violation("distance", run.length - 1, None, what) if near else None
+
+
+def bound(run: Run) -> Checks:
+    """Check that a team without faults whose first robot searches is localised within its bound."""
+    scenario, end = run.scenario, run.end
+    searches = scenario.team is not None and scenario.team.diameter
+    if end is None or not searches or scenario.faults or scenario.deaths or end.outcome != "localised":
+        return
+    took = end.tick * scenario.mission.period
+    what = f"it takes {took:.6g} s until all are localised, expected at most {scenario.t_max:.6g} s"
+    yield Violation("bound", end.tick, None, what) if took > scenario.t_max else None
 
 
 def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> Violation | None:

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 
 from compose.audit import scenario_rules
 from compose.audit.agent_rules import decision, limits, log
-from compose.audit.claim_rules import claim, outcome
+from compose.audit.claim_rules import bound, claim, distance, outcome
 from compose.audit.delivery_rules import contact, link_statistics, observation, report
 from compose.audit.findings import Checks, Findings, findings_of
 from compose.audit.journal_rules import config, order
@@ -27,6 +27,8 @@ AUDIT_RULES: Rules = (
     limits,
     log,
     claim,
+    distance,
+    bound,
 )
 """The rules of the audit, in order: if violations of one cause violations of another, it comes first."""
 HARDWARE_RULES: Rules = (order, scenario_rules.config, report, decision, limits, log)

@@ -13,6 +13,7 @@ from typing import Any, Literal
 import msgspec
 
 from compose.extras import version
+from compose.recording.closest_approach import nearest
 from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.group_localisation import MeetingResult, SearchResult, meeting_results, search_results
 from compose.recording.reasons import of_it, outcome_after, reason_for
@@ -51,6 +52,7 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
             ),
             default=None,
         ),
+        "nearest_m": nearest(run) if scenario.mission.safety_distance else None,
         "parameters": {
             **msgspec.to_builtins(scenario.mission),
             "planner": scenario.planner_name,

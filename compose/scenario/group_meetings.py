@@ -115,14 +115,7 @@ def group_meetings(
 
     meeting = meeting_ticks(mission) * mission.period
     plan = group_plan(anchors, pair_time, mission.max_speed, meeting, nearest)
-    turned = mission.noise.priors.gyro_bias * plan.bound
-    if not mission.noise.exact and turned > MOST_TURNED:
-        enough = rounded_down(MOST_TURNED / plan.bound)
-        raise Unworkable(
-            f"mission.noise.gyro_bias: within the {plan.bound:.0f} s of the plan, a bias of "
-            f"{mission.noise.priors.gyro_bias:g} rad/s turns a robot by {turned:.2g} rad, more than "
-            f"{MOST_TURNED:g}: calibrate the gyros to {enough:g} rad/s, or let the robots meet in pairs"
-        )
+    check_gyros(mission, plan.bound, "of the plan", ", or let the robots meet in pairs")
     extra = exchange_ticks(faults)
     meetings = _delayed(plan.meetings, mission, (extra[0] * mission.period, extra[1] * mission.period))
     bound = meetings[-1].ends
@@ -162,6 +155,17 @@ def _delayed(
         later[one.visitor] = later[one.visited] = late
         found.append(msgspec.structs.replace(one, ends=one.ends + late))
     return sorted(found, key=lambda one: one.ends)
+
+
+def check_gyros(mission: Mission, seconds: float, when: str, instead: str = "") -> None:
+    """Raise Unworkable if a bias of the gyros turns a robot too far within the `seconds` without a fix."""
+    turned = mission.noise.priors.gyro_bias * seconds
+    if turned > MOST_TURNED:
+        raise Unworkable(
+            f"mission.noise.gyro_bias: within the {seconds:.0f} s {when}, a bias of "
+            f"{mission.noise.priors.gyro_bias:g} rad/s turns a robot by {turned:.2g} rad, more than "
+            f"{MOST_TURNED:g}: calibrate the gyros to {rounded_down(MOST_TURNED / seconds):g} rad/s{instead}"
+        )
 
 
 def rounded_down(value: float) -> float:

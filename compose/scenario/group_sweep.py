@@ -9,7 +9,7 @@ import msgspec
 
 from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
-from compose.scenario.group_meetings import MOST_TURNED, FirstMeeting, GroupMeetings, rounded_down
+from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, check_gyros, rounded_down
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
 from protocol.mission import Mission, infeasibility
 from protocol.noise import VelocityNoise
@@ -159,7 +159,9 @@ def _planned_sweep(
         if not exact:
             rounds = ways_between_passages(path)
             ticks += 2 * len(rounds) * off_anchor
-            _check_gyros(mission, math.ceil(ticks / len(rounds)))
+            check_gyros(
+                mission, math.ceil(ticks / len(rounds)) * mission.period, "between two passages of its anchor"
+            )
             _check_odometry(mission, rounds)
         latest = max(latest, free[robot] + ticks * mission.period)
     return PlannedSweep(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)
@@ -193,18 +195,6 @@ def _next_sweep_ticks(sweep: SweptArea, mission: Mission, widest: float, unancho
     turn = turn_ticks(mission)
     visit = math.ceil(widest / (mission.max_speed * mission.period)) + turn
     return (sweep.parts - 1) * visit + turn + max(ticks_of_parts(sweep, mission, widest, unanchored))
-
-
-def _check_gyros(mission: Mission, ticks: int) -> None:
-    """Raise Unworkable if a bias of the gyros turns a robot too far within the `ticks` of a round."""
-    turned = mission.noise.priors.gyro_bias * ticks * mission.period
-    if turned > MOST_TURNED:
-        enough = rounded_down(MOST_TURNED / (ticks * mission.period))
-        raise Unworkable(
-            f"mission.noise.gyro_bias: within the {ticks * mission.period:.0f} s between two passages of its "
-            f"anchor, a bias of {mission.noise.priors.gyro_bias:g} rad/s turns a robot that sweeps by "
-            f"{turned:.2g} rad, more than {MOST_TURNED:g}: calibrate the gyros to {enough:g} rad/s"
-        )
 
 
 def _check_odometry(mission: Mission, ways: Sequence[Sequence[Place]]) -> None:

@@ -10,6 +10,7 @@ from msgspec.structs import replace
 
 from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
+from compose.scenario.group_meetings import check_gyros
 from compose.scenario.scenario_tables import MAX_TEAM, AnchorTable, Area, RobotTable, ScenarioFile, TeamTable
 from protocol.messages import TeamAnchor
 from protocol.mission import Anchor, Mission
@@ -62,14 +63,17 @@ def planned_team(file: ScenarioFile) -> tuple[PlannedTeam, tuple[RobotSpec, ...]
         robots.append(RobotSpec(robot.id, None, None, ORIGIN, robot.attack, ranges))
     known = [one.told for one in anchors]
     if mission.frame is None:
-        robots = [_in_range(i, file, one, anchors) for i, one in enumerate(robots)]
+        for i, one in enumerate(robots):
+            robots[i] = _in_range(i, file, one, anchors, [other.start for other in robots[:i]])
         away = [nearest_other(one, known) for one in known]
         farthest = max([one for one in away if one is not None], default=0.0)
     else:
         robots, farthest = _connected(file, robots), 0.0
     ticks = team_ticks(mission, len(robots), farthest) * (1 if mission.frame is None else len(robots))
     if mission.diameter:
-        ticks += search_ticks(mission, len(robots), mission.diameter)
+        search = search_ticks(mission, len(robots), mission.diameter)
+        check_gyros(mission, search * mission.period, "of the search by the first robot")
+        ticks += search
     origin = robots[0].id if mission.frame is not None else None
     told = anchors, origin, ticks * mission.period, mission.survey, mission.diameter
     return PlannedTeam(*told), tuple(robots)
@@ -91,8 +95,6 @@ def _check(file: ScenarioFile) -> None:
 
 def _check_mission(file: ScenarioFile) -> None:
     """Raise BadScenario or Unworkable if the mission or its planner is not one of teams."""
-    if file.mission.safety_distance:
-        raise Unworkable("mission.safety_distance: robots that share [[anchor]] or a frame keep none")
     if not planner_loader.is_for_teams(file.planner.name):
         raise Unworkable(
             f"planner.name: robots with the planner {file.planner.name} form pairs and groups; those that "
@@ -170,7 +172,9 @@ def _within(area: Area, right: float, up: float) -> tuple[float, float]:
     return x_min + (x_max - x_min) * right, y_min + (y_max - y_min) * up
 
 
-def _in_range(i: int, file: ScenarioFile, robot: RobotSpec, anchors: Sequence[PlacedAnchor]) -> RobotSpec:
+def _in_range(
+    i: int, file: ScenarioFile, robot: RobotSpec, anchors: Sequence[PlacedAnchor], others: Sequence[Pose]
+) -> RobotSpec:
     """Return the robot at its start, in range of an anchor from which it can reach another one."""
     mission, given = file.mission, file.robot[i].start
     known = [one.told for one in anchors if one.told.id in robot.ranges]
@@ -188,11 +192,13 @@ def _in_range(i: int, file: ScenarioFile, robot: RobotSpec, anchors: Sequence[Pl
                 f"robot[{i}].start: no anchor that '{robot.id}' knows and may range is within "
                 f"mission.sensing_range = {mission.sensing_range:.9g} m"
             )
+        if near := _too_near(start, others, mission):
+            raise BadScenario(f"robot[{i}].start: {near}")
         return replace(robot, start=start)
     draw, area = random.Random(f"{file.seed}/start/{robot.id}").random, _area(file)
     for _ in range(MOST_DRAWS):
         start = Pose(*_within(area, draw(), draw()), TAU * draw())
-        if _reached(start, places, mission):
+        if _reached(start, places, mission) and not _too_near(start, others, mission):
             return replace(robot, start=start)
     raise Unworkable(
         f"robot[{i}].start: none of {MOST_DRAWS} places in the area is in range of an anchor of '{robot.id}'"
@@ -203,6 +209,21 @@ def given_start(given: tuple[float, float, float]) -> Pose:
     """Return the start of a file. Many turns are removed: functions of large angles lose digits."""
     x, y, heading = given
     return Pose(x, y, heading if abs(heading) <= TAU else wrap(heading))
+
+
+def _too_near(start: Pose, others: Sequence[Pose], mission: Mission) -> str:
+    """Return why a start is too near to one of the `others`; else an empty text.
+
+    Each robot has the way of a tick to the safety distance, with ranges that are too short.
+    """
+    if not mission.safety_distance:
+        return ""
+    from agent.planning.separation import LARGEST_ERROR_SIGMAS  # noqa: PLC0415  # it imports numpy
+
+    errors = LARGEST_ERROR_SIGMAS * mission.noise.mutual_sigma
+    least = mission.safety_distance + errors + 2.0 * mission.first_straight
+    near = any(math.dist((start.x, start.y), (at.x, at.y)) < least for at in others)
+    return f"nearer to another one than {least:.3g} m (safety_distance)" if near else ""
 
 
 def _reached(start: Pose, places: Sequence[Anchor], mission: Mission) -> bool:
@@ -220,12 +241,15 @@ def _connected(file: ScenarioFile, robots: Sequence[RobotSpec]) -> list[RobotSpe
     for i, robot in enumerate(file.robot):
         if robot.start is not None:
             starts.append(given_start(robot.start))
+            if near := _too_near(starts[-1], starts[:-1], file.mission):
+                raise BadScenario(f"robot[{i}].start: {near}")
             continue
         draw = random.Random(f"{file.seed}/start/{robot.id}").random
         for _ in range(MOST_DRAWS):
             start = Pose(*_within(_area(file), draw(), draw()), TAU * draw())
             others = starts[:1] if diameter else starts
-            if not starts or any(math.hypot(start.x - at.x, start.y - at.y) <= reach for at in others):
+            close = not starts or any(math.hypot(start.x - at.x, start.y - at.y) <= reach for at in others)
+            if close and not _too_near(start, starts, file.mission):
                 break
         else:
             raise Unworkable(f"robot[{i}].start: no place in the area is in range of another robot")
@@ -233,11 +257,11 @@ def _connected(file: ScenarioFile, robots: Sequence[RobotSpec]) -> list[RobotSpe
     left = list(range(1, len(starts)))
     seen = [0]
     for one in seen[:1] if diameter else seen:
-        near = [
+        met = [
             k for k in left if math.hypot(starts[one].x - starts[k].x, starts[one].y - starts[k].y) <= reach
         ]
-        seen += near
-        left = [k for k in left if k not in near]
+        seen += met
+        left = [k for k in left if k not in met]
     if left and diameter:
         raise Unworkable(
             f"robot[{left[0]}].start: it is not within mission.diameter = {diameter:.9g} m of that of "
