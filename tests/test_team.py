@@ -19,6 +19,7 @@ from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
 from agent.planning.team import TeamPlanner
 from agent.planning.team_state import TeamState
+from compose.audit.claim_rules import bound, distance
 from compose.audit.rules import audit_run, replayed
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
@@ -171,6 +172,21 @@ def test_robots_of_a_team_keep_the_safety_distance(frame: str) -> None:
     assert run.end.outcome == "localised"
     assert audit_run(run).violations == ()
     assert summary(run, None, None)["nearest_m"] >= 0.6
+
+
+def test_robots_that_come_too_near_and_a_search_that_takes_too_long_are_violations() -> None:
+    run = run_mission(SCATTERED)
+    assert [one for rule in (distance, bound) for one in rule(run) if one is not None] == []
+    assert run.scenario.team is not None
+    mission, late = replace(run.scenario.mission, safety_distance=9.0), replace(run.scenario.team, bound=1.0)
+    history = run.history
+    for changed, rule in (
+        (replace(run.scenario, mission=mission), distance),
+        (replace(run.scenario, team=late), bound),
+    ):
+        other = replace(run, world=replace(history, scenario=changed))
+        (found,) = [one for one in rule(other) if one is not None]
+        assert found.rule == rule.__name__
 
 
 KILLS = ("a@2 world@4", "", "b@1:command b@3:report world@0")
