@@ -21,15 +21,14 @@ from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.posterior import Hypothesis
 from agent.planning import separation
 from agent.planning.active_sensing import AmongBeacons, plan_among
+from agent.planning.agenda import Bypass
 from agent.planning.drive import homing, pursuit, towards
 from agent.planning.strides import stride
-from agent.planning.tasks import Travelling
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
-from agent.planning.visit import passed
+from agent.planning.visit import BLOCKED_AFTER, CLEARANCE
 from protocol.messages import Undecided
 from protocol.motion import REST, TAU, Controls, Pose
 from protocol.orbits import Orbit
-from protocol.sweep_strips import Place
 from protocol.sweep_ticks import sweep_speed
 from protocol.team_motion import loop, loop_ticks, nearest_other, spiral, way_past
 
@@ -48,6 +47,15 @@ With less, missions in which the next ranges would suffice take longer by these 
 LAPS = (0.0, 0.5, -0.5, 1.0, -1.0)
 """The distances by which consecutive laps of the way past an anchor lie outside it, in units of R."""
 
+ELSEWHERE_TURN = 2.4
+"""The angle (rad) from one blocked way aside to the next, about the golden one."""
+
+NEARLY_BLOCKED = 0.25
+"""The way that is left in a tick, as a fraction of A_0, below which a robot drives aside.
+
+With less, noisy ranges leave no way at all, in any direction, before it does.
+"""
+
 
 def next_task(state: TeamState) -> TeamState:
     """Return `state` with the task and the controls of the next tick: the first that has a reason."""
@@ -62,30 +70,45 @@ def next_task(state: TeamState) -> TeamState:
 
 
 def _passing_robots(state: TeamState) -> TeamState:
-    """Return `state` with the way that the safety distance leaves; if it is blocked, on a way aside."""
-    mission, here = state.config.mission, state.odometry
+    """Return `state` with the way that the safety distance leaves; if it is blocked, on a way aside.
+
+    Ranges tell no direction: it drives back and to one side; if that is blocked, too, back elsewhere.
+    """
+    mission, here, passing = state.config.mission, state.odometry, state.passing
     if not mission.safety_distance:
         return state
-    ahead = Travelling((here.x + math.cos(here.heading), here.y + math.sin(here.heading)))
-    way = ahead if state.controls.v else None
     free = [separation.SHARE_OF_EACH * separation.leeway(rho, mission) for rho in state.apart.values()]
-    passing = passed(state.passing, way, here, min(free, default=math.inf), mission)
-    if passing.places and _aside(passing.places, state) is None:
-        passing = replace(passing, places=passing.places[1:])
+    passing = replace(passing, leeway=min(free, default=math.inf))
+    if passing.places and (_aside(passing, state) is None or state.controls == REST):
+        passing = replace(passing, places=passing.places[1:] if state.controls != REST else ())
+    v = (_aside(passing, state) or state.controls).v
+    blocked = v and passing.leeway < NEARLY_BLOCKED * mission.first_straight
+    passing = replace(passing, blocked=passing.blocked + 1 if blocked else 0)
+    if passing.blocked >= (BLOCKED_AFTER if passing.places else 1):
+        bearing, away = here.heading, mission.safety_distance + CLEARANCE * mission.sensing_range
+        side = math.pi / 2 if passing.detours % 2 == 0 else -math.pi / 2
+        if passing.places:
+            x, y = passing.places[0]
+            bearing = math.atan2(y - here.y, x - here.x) + ELSEWHERE_TURN
+        elif v > 0.0:
+            bearing += math.pi
+        x, y = here.x + away * math.cos(bearing), here.y + away * math.sin(bearing)
+        beside = x + away * math.cos(bearing + side), y + away * math.sin(bearing + side)
+        passing = replace(passing, blocked=0, detours=passing.detours + 1, places=((x, y), beside))
     return replace(state, passing=passing)
 
 
 def safe_controls(state: TeamState) -> Controls:
     """Return the controls of the task, or aside of it, at a speed that keeps the safety distance."""
-    controls, passing = state.controls, state.passing
-    if passing.places:
-        controls = _aside(passing.places, state) or REST
+    controls, passing = _aside(state.passing, state) or state.controls, state.passing
     most = passing.leeway / state.config.mission.period
     return Controls(min(max(controls.v, -most), most), controls.omega)
 
 
-def _aside(places: Sequence[Place], state: TeamState) -> Controls | None:
-    return homing(Pose(*places[0], 0.0), state.odometry, state.config.mission, ARRIVED)
+def _aside(passing: Bypass, state: TeamState) -> Controls | None:
+    if not passing.places:
+        return None
+    return homing(Pose(*passing.places[0], 0.0), state.odometry, state.config.mission, ARRIVED)
 
 
 def _at_rest(state: TeamState) -> TeamState | None:
