@@ -12,8 +12,9 @@ from types import SimpleNamespace
 import pytest
 
 from protocol.network import keys
+from protocol.network.clock import Clock
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox, Topic
-from world.hardware import bridge, termination
+from world.hardware import bridge
 
 TRANSPORT_S = 1e-4
 """The simulated transport time of a frame, in s."""
@@ -23,14 +24,12 @@ class Stage(Inbox):
     """The clock, network and inbox of a bridge, in one thread and independent of the speed of the machine."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
-        super().__init__("field")
         self.now = 0.0
+        super().__init__("field", Clock(true=self.monotonic))
         self.put_frames: list[tuple[str, bytes]] = []
         """keys and frames that the bridge has sent"""
         self.answer: Callable[[str, bytes], None] = lambda _key, _frame: None
         self._coming: list[tuple[float, int, Arrival]] = []
-        for module in (bridge, termination):
-            monkeypatch.setattr(module, "time", self)
         monkeypatch.setattr(
             bridge,
             "session",

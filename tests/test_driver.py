@@ -258,7 +258,7 @@ def ended(
     own: Verdict | None, said: TickStart | None, timeout: float = 60.0, ticks: int = 30
 ) -> MissionEnd | None:
     """Return the MissionEnd if a reaches the verdict `own` at tick 10 and receives `said` at tick 12."""
-    ending = Ending(CONFIG, 25, timeout)
+    ending = Ending(CONFIG, 25, timeout, time.monotonic)
     for tick in range(ticks):
         if tick == 12 and said is not None:
             ending.receive(said)

@@ -204,8 +204,8 @@ def result(robot: str, verdict: Verdict | None = LOCALISED, *, complete: bool = 
 
 
 @pytest.fixture
-def ending(stage: Stage) -> Ending:  # noqa: ARG001  # its clock is that of the stage
-    return Ending(config_in_group("a"), 800, 30.0)
+def ending(stage: Stage) -> Ending:
+    return Ending(config_in_group("a"), 800, 30.0, stage.monotonic)
 
 
 def ends(ending: Ending, ticks: range, *, rests: bool = True) -> MissionEnd | None:

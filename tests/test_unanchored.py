@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import random
+import time
 from pathlib import Path
 from typing import Any
 
@@ -364,7 +365,7 @@ def test_a_driver_may_report_the_range_to_an_anchor_that_its_robot_does_not_have
 
 def given_up_after(scenario: Scenario) -> int:
     """Return the tick in which a stops waiting for u, which has sent nothing in hardware mode."""
-    ending = Ending(scenario.config("a"), scenario.max_ticks, 0.0)
+    ending = Ending(scenario.config("a"), scenario.max_ticks, 0.0, time.monotonic)
     for robot in "bv":
         ending.receive(TickStart(1, robot, Localised(ORIGIN), complete=True))
     localised = Localised(ORIGIN)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 
 import pytest
@@ -129,7 +130,7 @@ def test_a_claim_below_the_required_accuracy_is_not_localised_in_hardware_mode(w
     good, vague = (Localised(ORIGIN, covariance(sigma, 0.01)) for sigma in (0.05, 4.5e7))
     own, peers = (vague, good) if whose == "its own" else (good, vague)
     for mine, other, outcome in ((own, peers, "undecided"), (good, good, "localised")):
-        ending = Ending(config, 100, 30.0)
+        ending = Ending(config, 100, 30.0, time.monotonic)
         ending.receive(TickStart(0, "b", other, complete=True))
         command = Command(0, "a", 0.0, 0.0, 3, "localised", mine)
         ends = []

@@ -117,7 +117,7 @@ class WorldProcess:
         and if the session can only receive.
         """
         self._processes.clear()  # it is not known which of them end before the next line
-        self._check = session.LinkCheck(link) if replaceable else None
+        self._check = session.LinkCheck(link, self._inbox.clock()) if replaceable else None
         run, inbox = self._run, self._inbox
         self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
         self._link_deadline = self._inbox.clock() + self._link_timeout

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Sequence
 from typing import NamedTuple
 
@@ -53,7 +52,7 @@ class Search:
         self._inbox = inbox
         self.process = os.urandom(8)
         """The identifier by which a world tells this process from another one of the same robot."""
-        self._began = time.monotonic()
+        self._began = inbox.clock()
         self._reported = False
 
     def wait(self, *, linked: bool = False, why: str | None = None) -> None:
@@ -63,7 +62,7 @@ class Search:
 
         Raises NoWorld when the search has lasted too long, and Interrupted when the process is asked to stop.
         """
-        waited = time.monotonic() - self._began
+        waited = self._inbox.clock() - self._began
         if waited >= self._wait:
             raise NoWorld(f"no {self._what}; gave up after {self._wait:g} s: {why or self._why(linked)}")
         if waited >= FIRST_WORD_S and not self._reported:
@@ -77,6 +76,10 @@ class Search:
         if linked:
             return "a router answers; check that the world runs, and that its access rules name this robot"
         return diagnosis.why(self._endpoints) or "no process has connected to it; check the others' endpoints"
+
+    def clock(self) -> float:
+        """Return the time in s."""
+        return self._inbox.clock()
 
     def pause(self) -> None:
         """Wait briefly while a world is visible. Raises Interrupted when the process is asked to stop."""
@@ -106,11 +109,11 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
     robot stays alive, or did so until the world ended. Raises whatever `search` raises while there is no
     world.
     """
-    began = time.monotonic()
+    began = search.clock()
     refused_since: float | None = None
     occupied: str | None = None
     second: str | None = None  # the last refusal while another process of the robot was alive
-    while time.monotonic() < began + (SESSION_S if occupied is None and second is None else FORMER_S):
+    while search.clock() < began + (SESSION_S if occupied is None and second is None else FORMER_S):
         worlds = [key.run for key in session.alive(link, keys.world_alive(run or "*"), QUERY_S)]
         offers = _offers(link, worlds[:MOST_WORLDS], robot, search.process)
         if len(offers.configs) > 1:
@@ -124,8 +127,8 @@ def join(link: zenoh.Session, run: str | None, robot: str, search: Search) -> tu
         if why is None or occupied is not None:
             refused_since = None
         elif refused_since is None:
-            refused_since = time.monotonic()
-        elif time.monotonic() > refused_since + REFUSED_S:
+            refused_since = search.clock()
+        elif search.clock() > refused_since + REFUSED_S:
             raise Unwelcome(why)
         if occupied is None and why is None:
             search.wait(linked=session.linked(link), why=offers.unusable)
@@ -169,9 +172,9 @@ def confirm(link: zenoh.Session, run: str, robot: str, search: Search) -> None:
     The world reserves it for a short time only, and this process may have needed longer until it was ready.
     Raises Unwelcome if another process has it since, for REFUSED_S.
     """
-    began = time.monotonic()
+    began = search.clock()
     while isinstance(why := _answer(link, run, robot, search.process), str):
-        if time.monotonic() > began + REFUSED_S:
+        if search.clock() > began + REFUSED_S:
             raise Unwelcome(why)
         search.pause()
 

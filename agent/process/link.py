@@ -49,21 +49,21 @@ class AgentLink:
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
         self._token = self._show_alive()
-        self._check = session.LinkCheck(link)
-        self._received_at = self._inbox.clock()
+        self._check = session.LinkCheck(link, self._inbox.clock())
+        self._received_at = self._inbox.awake()
 
     def next(self, until: float) -> Arrival:
-        """Return the next arrival, or NO_ARRIVAL once the monotonic clock reaches `until`.
+        """Return the next arrival, or NO_ARRIVAL once the clock reaches `until`.
 
         Raises WorldLinkLost if no Observation has arrived for too long, or if the session cannot send.
         """
         lost = self._received_at + self._link_timeout
-        arrival = self._inbox.next(min(until, lost) - self._inbox.clock())
+        arrival = self._inbox.next(min(until - self._inbox.clock(), lost - self._inbox.awake()))
         if arrival.topic == "observation":
-            self._received_at = self._inbox.clock()
-            if self._check.is_mute(self._received_at):
+            self._received_at = self._inbox.awake()
+            if self._check.is_mute(self._inbox.clock()):
                 raise WorldLinkLost
-        elif arrival is NO_ARRIVAL and self._inbox.clock() >= lost:
+        elif arrival is NO_ARRIVAL and self._inbox.awake() >= lost:
             raise WorldLinkLost
         return arrival
 

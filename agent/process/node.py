@@ -9,6 +9,7 @@ arrives is replaced by a new one.
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
@@ -74,13 +75,14 @@ class AgentProcess:
         self._tick_s = config.tick_s
         self._world_timeout = timeout + (self._tick_s or 0.0)
         """The longest time in s between two new frames from the world."""
-        self._give_up = self._inbox.clock() + self._world_timeout
+        self._give_up = self._inbox.awake() + self._world_timeout
+        """The time of `Inbox.awake` at which the world has been silent for too long."""
         self._on_kill_point = on_kill_point
         self._robot = memory.robot
         self._observation = memory.observation
         """The latest Observation."""
         self._due: float | None = None
-        """The time (monotonic clock) after which listed reports are no longer awaited; None in lockstep."""
+        """The time after which listed reports are no longer awaited; None in lockstep."""
         if self._observation is not None and self._robot.command is None:
             self._set_due()
         real_time = self._tick_s is not None
@@ -95,8 +97,8 @@ class AgentProcess:
         self._launched = launched
         self._loss_reported = False
         """True once the loss of the world has been reported to the user."""
-        self._repeated_at = 0.0
-        """The time (monotonic clock) of the last repetition."""
+        self._repeated_at = -math.inf
+        """The time of the last repetition."""
         self._repeat_at: float | None = None
         """The time of the next repetition, if one was requested within AGAIN_S of the last."""
         self._own_reports = deque(memory.own_reports, maxlen=OWN_REPORTS_KEPT)
@@ -123,7 +125,7 @@ class AgentProcess:
                     elif isinstance(message, TickStart) or (
                         isinstance(message, Observation) and self._on_observation(message, arrival.frame)
                     ):
-                        self._give_up = self._inbox.clock() + self._world_timeout
+                        self._give_up = self._inbox.awake() + self._world_timeout
                 case "report" if arrival.source.robot not in self._others:
                     self._inbox.refuse(arrival, "its sender is not in this mission")
                 case "report":
@@ -173,10 +175,11 @@ class AgentProcess:
         """
         if self._repeat_at is not None and self._inbox.clock() >= self._repeat_at:
             self._repeat_answers()
-        return self._link.next(min(until or self._give_up, self._give_up, self._repeat_at or self._give_up))
+        give_up = self._give_up + self._inbox.clock() - self._inbox.awake()
+        return self._link.next(min(until or give_up, give_up, self._repeat_at or give_up))
 
     def _check_timeout(self) -> None:
-        if self._inbox.clock() > self._give_up:
+        if self._inbox.awake() >= self._give_up:
             raise NoWorld(f"nothing received from the world for {self._world_timeout:g} s")
 
     @property
@@ -205,7 +208,7 @@ class AgentProcess:
             if self._on_kill_point is not None:
                 self._on_kill_point("observation", observation.tick)
             if self._due is not None:  # the world has advanced; absent reports count as missed
-                self._due = 0.0
+                self._due = -math.inf
                 self._decide_when_reports_complete()
             self._out_of_step.over()
             self._observation = observation
@@ -302,7 +305,7 @@ class AgentProcess:
             frames_refused=self._inbox.refused.total(),
         )
         self.end = end
-        self._give_up = self._inbox.clock() + self._timeout
+        self._give_up = self._inbox.awake() + self._timeout
 
     def _answer_end(self, end: MissionEnd) -> MissionEnd:
         """Answer every repetition of the MissionEnd until the world confirms that it has the answer."""
@@ -311,8 +314,8 @@ class AgentProcess:
         self._link.command(frame)
         self._out_of_step.over()
         gone = False
-        while (now := self._inbox.clock()) < self._give_up:
-            arrival = self._next(now + LAST_WORD_S if gone else None)
+        while self._inbox.awake() < self._give_up:
+            arrival = self._next(self._inbox.clock() + LAST_WORD_S if gone else None)
             if arrival.topic == "observation":
                 if arrival.frame == frame:
                     break

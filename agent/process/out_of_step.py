@@ -25,7 +25,7 @@ class OutOfStep:
         self._appear = appear
         self._real_time = real_time
         self._latest: tuple[Observation | MissionEnd, float] | None = None
-        """The latest message, and the time (monotonic clock) of the first in the series."""
+        """The latest message, and the time of the first in the series."""
         self._world_there = True
 
     def over(self) -> None:

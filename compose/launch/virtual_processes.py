@@ -13,11 +13,11 @@ import math
 import random
 import threading
 from collections import deque
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from itertools import count
 from pathlib import Path
-from types import SimpleNamespace
+from types import MappingProxyType, SimpleNamespace
 from typing import Any, NamedTuple, cast
 
 import zenoh
@@ -31,7 +31,8 @@ from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
 from compose.scenario.kills import WORLD, Kill
 from protocol.journal.journal_file import Journal
 from protocol.journal.resume import Retrace
-from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
+from protocol.network.clock import Clock, ClockError
+from protocol.network.inbox import NO_ARRIVAL, SIGNAL_S, Arrival, Inbox
 from world.process import WorldProcess
 from world.scenario import Scenario
 from world.simulation import Simulation, resumed
@@ -49,6 +50,12 @@ VIRTUAL_START_S = 0.3
 """The time in s that a process takes to start."""
 VIRTUAL_TIMEOUT_S = 30.0
 """The time in s of the virtual clock that the processes wait for each other."""
+
+
+DRIVER = "driver of "
+"""The beginning of the name of a driver's process in hardware mode."""
+LEAST_WAIT_S = 1e-6
+"""The least wait in s, so that rounding cannot make one without an end."""
 
 
 class VirtualEnd(NamedTuple):
@@ -73,16 +80,27 @@ class _Sample(NamedTuple):
     attachment: zenoh.ZBytes | None = None
 
 
-def run_mission(scenario: Scenario, folder: Path, kills: Sequence[Kill] = ()) -> VirtualEnd:
-    """Run `scenario`, write its journals to `folder`, and return how it ended. Killed processes restart."""
-    return _Network(scenario, folder, kills).run()
+def run_mission(
+    scenario: Scenario,
+    folder: Path,
+    kills: Sequence[Kill] = (),
+    clocks: Mapping[str, ClockError] = MappingProxyType({}),
+) -> VirtualEnd:
+    """Run `scenario`, write its journals to `folder`, and return how it ended. Killed processes restart.
+
+    `clocks` are the errors of the clocks of robots and of the world, by name.
+    """
+    network = VirtualNetwork(scenario, folder, kills, clocks)
+    network.run({WORLD: world_process} | {one.id: agent_process for one in scenario.robots})
+    return VirtualEnd(network.taken, tuple(network.failures))
 
 
-class _Process:
+class VirtualProcess:
     """One process of the mission: a thread that runs only while the network waits for it."""
 
-    def __init__(self, network: _Network, name: str) -> None:
+    def __init__(self, network: VirtualNetwork, name: str, body: Body) -> None:
         self.name = name
+        self._body = body
         self.left = [kill for kill in network.kills if kill.who == name]
         """The kills that have not taken place."""
         self._network = network
@@ -90,12 +108,12 @@ class _Process:
         self._back = threading.Semaphore(0)
         self._waits = 0
         """The number of waits so far, so that the end of an earlier one does not wake it."""
-        self.link: _Link | None = None
+        self.link: VirtualLink | None = None
         """The session; None while the process does not run."""
 
     def start(self) -> None:
         """Start the process, and run it until it waits."""
-        self.link = _Link(self._network, self)
+        self.link = VirtualLink(self._network, self)
         threading.Thread(target=self._main, daemon=True).start()
         self._back.acquire()
 
@@ -118,7 +136,7 @@ class _Process:
     def _main(self) -> None:
         network = self._network
         try:
-            (_world if self.name == WORLD else _agent)(network, self)
+            self._body(network, self)
         except _Killed:
             if not network.over:
                 self._restart()
@@ -151,35 +169,44 @@ class _Process:
                 raise _Killed
 
 
-class _Network:
+class VirtualNetwork:
     """The clock, the events that are due, and the subscriptions of all processes."""
 
-    def __init__(self, scenario: Scenario, folder: Path, kills: Sequence[Kill]) -> None:
-        self.scenario, self.folder, self.kills = scenario, folder, kills
+    def __init__(
+        self,
+        scenario: Scenario,
+        folder: Path,
+        kills: Sequence[Kill],
+        clocks: Mapping[str, ClockError],
+        tick_s: float | None = None,
+    ) -> None:
+        """`tick_s` is the duration of a tick in s; None in lockstep."""
+        self.scenario, self.folder, self.kills, self.clocks = scenario, folder, kills, clocks
+        self.tick_s = tick_s
         self.now = 0.0
         self.over = False
         self.taken = 0
         self.failures: list[str] = []
         self.ended: list[str] = []
-        self.subscribers: list[tuple[_Link, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
-        self.watchers: list[tuple[_Link, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
-        self.tokens: list[tuple[_Link, str]] = []
+        self.subscribers: list[tuple[VirtualLink, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
+        self.watchers: list[tuple[VirtualLink, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
+        self.tokens: list[tuple[VirtualLink, str]] = []
         self._due: list[tuple[float, int, Callable[[], None]]] = []
         self._number = count()
         self._draw = random.Random(f"{scenario.seed}/latency")
-        self._latest: dict[tuple[_Link, str], float] = {}
+        self._latest: dict[tuple[VirtualLink, str], float] = {}
         """The time of the latest arrival at each link on each key."""
-        self._woken: dict[_Process, None] = {}
+        self._woken: dict[VirtualProcess, None] = {}
         """The processes for which something has arrived at this time, in its order."""
-        self._matching: dict[str, list[tuple[_Link, Callable[[_Sample], None]]]] = {}
+        self._matching: dict[str, list[tuple[VirtualLink, Callable[[_Sample], None]]]] = {}
 
     def at(self, due: float, act: Callable[[], None]) -> None:
         """Call `act` when the clock reaches `due`, after everything that was due by then before this call."""
         heapq.heappush(self._due, (due, next(self._number), act))
 
-    def run(self) -> VirtualEnd:
-        """Run all processes until they have ended, or one has failed."""
-        processes = [_Process(self, name) for name in (WORLD, *[one.id for one in self.scenario.robots])]
+    def run(self, bodies: Mapping[str, Body]) -> None:
+        """Run a process for each of `bodies`, by name, until they have ended, or one has failed."""
+        processes = [VirtualProcess(self, name, body) for name, body in bodies.items()]
         for one in processes:
             self.at(0.0, one.start)
         while (self._due or self._woken) and not self.failures and len(self.ended) < len(processes):
@@ -194,7 +221,6 @@ class _Network:
         self.over = True
         for one in processes:
             one.wake()
-        return VirtualEnd(self.taken, tuple(self.failures))
 
     def send(self, key: str, frame: bytes) -> None:
         """Deliver `frame` to all subscribers of `key`, after a time of LATENCIES_S."""
@@ -208,7 +234,9 @@ class _Network:
             due = self._latest[link, key] = max(due, self._latest.get((link, key), 0.0))
             self.deliver(link, to, sample, due - self.now)
 
-    def deliver(self, link: _Link, to: Callable[[_Sample], None], sample: _Sample, delay: float) -> None:
+    def deliver(
+        self, link: VirtualLink, to: Callable[[_Sample], None], sample: _Sample, delay: float
+    ) -> None:
         """Give `sample` to a subscriber of `link` after `delay` s, and let its process run."""
 
         def arrive() -> None:
@@ -219,7 +247,7 @@ class _Network:
         self.at(self.now + delay, arrive)
 
     def subscribe(
-        self, link: _Link, key: str, to: Callable[[_Sample], None], *, tokens: bool = False
+        self, link: VirtualLink, key: str, to: Callable[[_Sample], None], *, tokens: bool = False
     ) -> None:
         """Let `to` receive what is sent on `key`, or the tokens there."""
         (self.watchers if tokens else self.subscribers).append((link, zenoh.KeyExpr(key), to))
@@ -228,27 +256,29 @@ class _Network:
             if zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(shown)):
                 self.deliver(link, to, _Sample(shown, zenoh.ZBytes(b"")), LATENCIES_S[0])
 
-    def show(self, link: _Link, key: str, *, gone: bool = False, delay: float = LATENCIES_S[0]) -> None:
-        """Show the liveliness token `key` of `link` to others, or withdraw it."""
+    def show(self, link: VirtualLink, key: str, *, gone: bool = False, delay: float = LATENCIES_S[0]) -> None:
+        """Show the liveliness token `key` of `link` to others, or withdraw it. One of several is none."""
         self.tokens.remove((link, key)) if gone else self.tokens.append((link, key))
+        if sum([shown == key for _, shown in self.tokens]) != (0 if gone else 1):
+            return
         kind = zenoh.SampleKind.DELETE if gone else zenoh.SampleKind.PUT
         for other, keys, to in self.watchers:
             if keys.intersects(zenoh.KeyExpr(key)):
                 self.deliver(other, to, _Sample(key, zenoh.ZBytes(b""), kind), delay)
 
-    def close(self, link: _Link | None) -> None:
-        """Remove the subscriptions and tokens of `link`."""
+    def close(self, link: VirtualLink | None, delay: float = NOTICE_S) -> None:
+        """Remove the subscriptions and tokens of `link`, which others see after `delay` s."""
         self.subscribers = [one for one in self.subscribers if one[0] is not link]
         self.watchers = [one for one in self.watchers if one[0] is not link]
         self._matching.clear()
         for one, key in [token for token in self.tokens if token[0] is link]:
-            self.show(one, key, gone=True, delay=NOTICE_S)
+            self.show(one, key, gone=True, delay=delay)
 
 
-class _Link:
+class VirtualLink:
     """The part of a Zenoh session that `protocol/network/session.py` uses, without viewers and routers."""
 
-    def __init__(self, network: _Network, process: _Process) -> None:
+    def __init__(self, network: VirtualNetwork, process: VirtualProcess) -> None:
         self._network, self.process = network, process
         self.info = SimpleNamespace(routers_zid=tuple)
 
@@ -297,28 +327,30 @@ def _ignored(_: object) -> None:
 class _VirtualInbox(Inbox):
     """An inbox whose waits last until the clock of the network."""
 
-    def __init__(self, network: _Network, process: _Process) -> None:
-        super().__init__(process.name)
+    def __init__(self, network: VirtualNetwork, process: VirtualProcess) -> None:
+        error = network.clocks.get(process.name.removeprefix(DRIVER))
+        super().__init__(process.name, Clock(error, true=lambda: network.now))
         self._network, self._process = network, process
-
-    def clock(self) -> float:
-        """Return the time of the network in s."""
-        return self._network.now
 
     def next(self, timeout: float | None) -> Arrival:
         """Return the next event, or NO_ARRIVAL after `timeout` s."""
-        until = self._network.now + timeout if timeout is not None else math.inf
-        while (arrival := super().next(0.0)) is NO_ARRIVAL and self._network.now < until:
-            self._process.wait(until)
+        until = self.clock() + timeout if timeout is not None else math.inf
+        while (arrival := super().next(0.0)) is NO_ARRIVAL and (left := until - self.clock()) > 0.0:
+            began = self.clock()
+            self._process.wait(self._network.now + max(min(left, SIGNAL_S), LEAST_WAIT_S))
+            self.waited(began, SIGNAL_S)
         return arrival
 
     def say(self, line: str) -> None:
         """Say nothing."""
 
 
-def _agent(network: _Network, process: _Process) -> None:
+def agent_process(network: VirtualNetwork, process: VirtualProcess) -> None:
     """Run an agent from its journal to the end of the mission, as `tandem agent` does."""
-    path, config = network.folder / agent_journal(process.name), network.scenario.config(process.name)
+    path, config = (
+        network.folder / agent_journal(process.name),
+        network.scenario.config(process.name, network.tick_s),
+    )
     old = Retrace(path) if path.exists() else None
     memory = remember(old, planner_of) if old is not None else None
     with old.open_for_append()[0] if old is not None else Journal(path) as journal:
@@ -331,13 +363,13 @@ def _agent(network: _Network, process: _Process) -> None:
             try:
                 agent.run()
             except WorldLinkLost:
-                network.close(process.link)
-                process.link = _Link(network, process)
+                network.close(process.link, LATENCIES_S[0])
+                process.link = VirtualLink(network, process)
             else:
                 return
 
 
-def _world(network: _Network, process: _Process) -> None:
+def world_process(network: VirtualNetwork, process: VirtualProcess) -> None:
     """Run the world from its journal to the end of the mission, as `tandem world` does."""
     path = network.folder / WORLD_JOURNAL
     old = Retrace(path) if path.exists() else None
@@ -349,3 +381,7 @@ def _world(network: _Network, process: _Process) -> None:
         world = WorldProcess(simulation, **process.arguments())
         world.attach(cast(Any, process.link))
         world.run()
+
+
+Body = Callable[[VirtualNetwork, VirtualProcess], None]
+"""What a process runs."""

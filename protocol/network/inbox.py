@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections import Counter
 from queue import Empty, SimpleQueue
 from typing import Any, Literal, NamedTuple, Protocol
 
+from protocol.network.clock import Clock
 from protocol.network.keys import UNKNOWN_KEY, Key
 from protocol.network.timer import Timer
 from protocol.output import say
@@ -82,7 +82,9 @@ class Inbox:
     callback, each of them would wake a thread that only wakes another one.
     """
 
-    def __init__(self, owner: str) -> None:
+    def __init__(self, owner: str, clock: Clock | None = None) -> None:
+        self.clock = clock or Clock()
+        """The clock by which the owner waits, in s."""
         self.refused = Counter[Topic]()
         """The number of refused frames by topic.
 
@@ -100,7 +102,9 @@ class Inbox:
         self._line: Line | None = None
         self._line_is_next = True
         """True if the line comes first when both have an event, so that neither starves the other."""
-        self._timer = Timer(self._wake)
+        self._timer = Timer(self._wake, self.clock)
+        self._asleep = 0.0
+        """The s that `awake` does not count."""
 
     def take_from(self, line: Line) -> None:
         """Take frames from `line`, too, until its session is closed. It replaces an earlier line."""
@@ -131,9 +135,17 @@ class Inbox:
                 entry = topic, "other keys", why
             self._turned_away[entry] += 1
 
-    def clock(self) -> float:
-        """Return the time in s of the clock by which the owner waits, which does not go back."""
-        return time.monotonic()
+    def awake(self) -> float:
+        """Return the time in s without jumps of the clock, and without suspensions of the process, in waits.
+
+        It tells for how long others have been silent.
+        """
+        return self.clock() - self._asleep
+
+    def waited(self, began: float, longest: float) -> None:
+        """Note that a wait, which was to last for at most `longest` s from `began` on, is over."""
+        late = self.clock() - began - longest
+        self._asleep += late if late > SIGNAL_S else 0.0
 
     def next(self, timeout: float | None) -> Arrival:
         """Return the next event, or NO_ARRIVAL after `timeout` s. Raises Interrupted for the topic "stop"."""
@@ -146,13 +158,16 @@ class Inbox:
         """Return the next event of the queue, or NO_ARRIVAL after `timeout`. Raises Interrupted."""
         until = self.clock() + timeout if timeout is not None else math.inf
         while True:
+            began = self.clock()
             try:
-                arrival = self._queue.get(timeout=min(max(until - self.clock(), 0.0), SIGNAL_S))
+                arrival = self._queue.get(timeout=min(max(until - began, 0.0), SIGNAL_S))
             except Empty:
                 if self.clock() >= until:
                     return NO_ARRIVAL
             else:
                 break
+            finally:
+                self.waited(began, SIGNAL_S)
         with self._lock:
             self._waiting[arrival.topic] -= _size(arrival)
         if arrival.topic == "stop":
@@ -166,14 +181,16 @@ class Inbox:
             idle = self._queue.empty()
             if idle or self._line_is_next:
                 self._line_is_next = False
-                wait = idle and self.clock() < until
+                began = self.clock()
+                wait = idle and began < until
                 if wait:
-                    self._timer.set(until)
+                    self._timer.set(min(until, began + SIGNAL_S))
                 try:
                     arrival = line.receive(wait=wait)
                 except LineClosed:
                     self._line = None
                     return self._queued(until - self.clock() if timeout is not None else None)
+                self.waited(began, SIGNAL_S)
                 if arrival is not None:
                     return arrival
             if not idle:

@@ -84,14 +84,13 @@ def open_router(endpoints: Endpoints, wait: float = 0.0, *, closes: bool = True)
     Raises CannotListen, and OSError if the process's limits are too low.
     """
     _check_limits()
-    give_up = time.monotonic() + wait
-    while True:
+    for left in range(round(wait / LISTEN_AGAIN_S), -1, -1):
         try:
             session = zenoh.open(zenoh_config(endpoints))
             break
         except zenoh.ZError as error:
             taken = "in use" in str(error)
-            if not taken or time.monotonic() >= give_up:
+            if not (taken and left):
                 why = "already in use" if taken else "cannot listen there"
                 raise CannotListen(f"{' and '.join(endpoints.listen)}: {why}") from None
         time.sleep(LISTEN_AGAIN_S)
@@ -232,17 +231,17 @@ class LinkCheck:
     and sends nothing: its publishers match, its tokens are visible, but it lists no router.
     """
 
-    def __init__(self, session: zenoh.Session) -> None:
-        """Check `session`, unless it has no router from the start because it is one."""
+    def __init__(self, session: zenoh.Session, now: float) -> None:
+        """Check `session` from `now` (s) on, unless it has no router from the start because it is one."""
         self._session = session
         self._failed = 0 if linked(session) else None
         """The number of failed checks in sequence; None if the session is not checked."""
-        self._check_at = time.monotonic() + LINK_CHECK_S
+        self._check_at = now + LINK_CHECK_S
 
     def is_mute(self, now: float) -> bool:
         """Return whether the session cannot send, given that it has received a message at time `now`.
 
-        Time is that of the monotonic clock. A link that is just being replaced fails one check at most.
+        A link that is just being replaced fails one check at most.
         """
         if now < self._check_at or self._failed is None:
             return False

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections.abc import Callable
 
 
@@ -15,16 +14,16 @@ class Timer:
     which it sleeps. Otherwise it sees the new time when it wakes.
     """
 
-    def __init__(self, wake: Callable[[], None]) -> None:
-        self._wake = wake
+    def __init__(self, wake: Callable[[], None], clock: Callable[[], float]) -> None:
+        self._wake, self._clock = wake, clock
         self._at = math.inf
-        """The time of the monotonic clock that was set last; infinite for none."""
+        """The time of the clock that was set last; infinite for none."""
         self._asleep_until = math.inf
         self._earlier = threading.Event()
         self._thread: threading.Thread | None = None
 
     def set(self, at: float) -> None:
-        """Expire once, when the monotonic clock reaches `at`, instead of at the time that was set before."""
+        """Expire once, when the clock reaches `at`, instead of at the time that was set before."""
         self._at = at
         if at < self._asleep_until:
             self._earlier.set()
@@ -38,11 +37,11 @@ class Timer:
             self._asleep_until = math.inf  # from here on, `set` wakes this thread
             self._earlier.clear()
             at = self._at
-            if at != expired_at and at <= time.monotonic():
+            if at != expired_at and at <= self._clock():
                 expired_at = at
                 self._wake()
             elif at in (expired_at, math.inf):
                 self._earlier.wait()
             else:
                 self._asleep_until = at
-                self._earlier.wait(min(at - time.monotonic(), threading.TIMEOUT_MAX))
+                self._earlier.wait(min(at - self._clock(), threading.TIMEOUT_MAX))

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import math
 import threading
-import time
 from collections import deque
 from collections.abc import Callable
 
@@ -62,10 +61,12 @@ One of a much earlier tick was sent by a robot that has been restarted without i
 MOST_TICKS_AHEAD = 2
 """The maximum number of ticks by which a robot may be ahead of the one that it follows, and wait for it."""
 
+SETTLING = 0.002
+"""The duration of the rest before a reading, at least, as a fraction of a manoeuvre: clocks drift apart."""
 AT_ONCE = 1000
 """The maximum number of messages that are processed without checking the time."""
 UNKNOWN = -math.inf
-"""An unknown time. It is less than any time, because monotonic clocks may start at 0."""
+"""An unknown time. It is less than any time, because clocks may start anywhere."""
 
 
 class NoStart(TimeoutError):
@@ -108,7 +109,7 @@ class Field:
         self._ended: Callable[[], None] = lambda: None
         self._journal = journal
         self._max_ticks = max_ticks
-        self._ending = Ending(config, max_ticks, self._timeout)
+        self._ending = Ending(config, max_ticks, self._timeout, inbox.awake)
         self._source = TickSource(config, self._tick_s)
         self._end: MissionEnd | None = None
         """The end of the mission that follows from the journal; None before."""
@@ -126,8 +127,8 @@ class Field:
         """The robots with a liveliness token."""
         self._unanswered: deque[tuple[int, bytes]] = deque()
         """The ticks and frames of the Observations that the agent has not answered."""
-        self._answered = 0.0
-        """The time of the agent's last Command. An agent that only appears again does not count."""
+        self._answered = UNKNOWN
+        """The time (`awake`) of the agent's last Command. An agent that only appears again does not count."""
         self._tick = -1
         self._next = UNKNOWN
         """The time at which the next tick begins."""
@@ -183,7 +184,7 @@ class Field:
         self._ended = ended
         end = self._end
         try:
-            self._gather(time.monotonic() + wait)
+            self._gather(self._inbox.clock() + wait)
             while end is None:
                 end = self._play_tick()
         except DriverFailed as failure:
@@ -213,28 +214,28 @@ class Field:
         Raises NoStart.
         """
         waiting_s = min(WAITING_S, 0.25 * self._timeout)
-        tell = time.monotonic() + waiting_s
-        unheard = time.monotonic() + UNHEARD * self._tick_s
+        tell = self._inbox.clock() + waiting_s
+        unheard = self._inbox.clock() + UNHEARD * self._tick_s
         while not self._may_begin():
             missing = [one for one in (self._id, *self._others) if one not in self._alive]
-            if self._restarted and not missing and time.monotonic() >= unheard:
-                self._next = time.monotonic()
+            if self._restarted and not missing and self._inbox.clock() >= unheard:
+                self._next = self._inbox.clock()
                 break
-            if time.monotonic() >= give_up:
+            if self._inbox.clock() >= give_up:
                 if self._source.joins and self._id not in missing and self._alive > {self._id}:
                     what = f"{' and '.join(missing)}: not connected" if missing else "no TickStart received"
                     self._inbox.say(f"{what}; the mission begins")
                     break
                 moved = "" if self._resumed else "; no robot has moved"
                 raise NoStart(f"{' and '.join(missing or self._others)}: not connected{moved}")
-            if (now := time.monotonic()) >= tell:
+            if (now := self._inbox.clock()) >= tell:
                 self._observation.put(encode(TickStart(self._tick + 1, self._id)))
                 tell = now + waiting_s
             until = min(give_up, tell, unheard) if self._restarted and unheard > now else min(give_up, tell)
-            self._take(self._inbox.next(until - time.monotonic()))
+            self._take(self._inbox.next(until - self._inbox.clock()))
         if self._next == UNKNOWN and not self._restarted:  # it follows nobody yet
             self._astray = ASTRAY
-        self._answered = time.monotonic()
+        self._answered = self._inbox.awake()
 
     def _may_begin(self) -> bool:
         if self._id not in self._alive:
@@ -246,7 +247,7 @@ class Field:
     def _play_tick(self) -> MissionEnd | None:
         self._tick += 1
         tick = self._tick
-        now = time.monotonic()
+        now = self._inbox.clock()
         self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
         if tick >= self._ahead or self._next > now:  # none while catching up: others would wait
             self._tick_start.put(encode(self._ending.tick_start(tick)))
@@ -255,17 +256,19 @@ class Field:
         self._unanswered.append((tick, observation))
         self._observation.put(observation)
         command = self._wait_for_command(tick)
-        until = time.monotonic()
+        until = self._inbox.clock()
         if command is not None:
             self._write(encode(command))
             self._drive(command)
-            until = time.monotonic() + self._manoeuvre_s
+            until = self._inbox.clock() + (1.0 + SETTLING) * self._manoeuvre_s
         else:
             self.missed += 1
-        while (now := time.monotonic()) < max(until, self._next):
-            self._take(self._inbox.next(max(until, self._next) - now))
+        while (now := self._inbox.clock()) < (end := max(until, self._next)):
+            self._take(self._inbox.next(end - now))
+            if command is not None and self._inbox.clock() > end + THINKING * self._manoeuvre_s:
+                until = self._inbox.clock() + (1.0 + SETTLING) * self._manoeuvre_s  # it jumped
         self._take_waiting()
-        if self._unanswered and now - self._answered > self._timeout:
+        if self._unanswered and self._inbox.awake() - self._answered > self._timeout:
             return self._failed(f"no answer from {self._id}'s agent for {self._timeout:g} s")
         return self._ending.after(tick, command)
 
@@ -278,10 +281,12 @@ class Field:
 
         Raises DriverFailed.
         """
+        began = self._inbox.clock()
         try:
             reading = self._driver.sense(tick)
         except (Exception, SystemExit) as error:  # a driver of the user may raise anything
             raise DriverFailed(f"sense({tick}): {type(error).__name__}: {error}") from error
+        self._inbox.waited(began, 0.0)  # nothing was taken meanwhile
         try:
             observation = observation_frame(reading, tick, self._config)
             return [observation, *mark_frames(reading, tick, self._id)]
@@ -306,7 +311,7 @@ class Field:
 
     def _wait_for_command(self, tick: int) -> Command | None:
         """Return the Command of this tick; None if it arrives too late for a manoeuvre in the tick."""
-        while (left := self._next - self._manoeuvre_s - time.monotonic()) > 0.0:
+        while (left := self._next - self._manoeuvre_s - self._inbox.clock()) > 0.0:
             command = self._take(self._inbox.next(left))
             if command is not None and command.tick == tick:
                 return command
@@ -352,7 +357,7 @@ class Field:
             return None
         while self._unanswered and self._unanswered[0][0] <= command.tick:
             self._unanswered.popleft()
-            self._answered = time.monotonic()
+            self._answered = self._inbox.awake()
         return command
 
     def _on_estimate(self, arrival: Arrival) -> None:
@@ -375,7 +380,7 @@ class Field:
         start: TickStart | None = self._inbox.accepted(arrival, TickStart, MAX_REPORT_BYTES)
         if start is None:
             return
-        left, now, in_group = self._tick + 1 - start.tick, time.monotonic(), self._source.joins
+        left, now, in_group = self._tick + 1 - start.tick, self._inbox.clock(), self._source.joins
         fits = (
             -self._astray <= left <= (MOST_TICKS_AHEAD if self._resumed or self._astray == ASTRAY else ASTRAY)
         )
@@ -412,13 +417,13 @@ class Field:
 
     def _finish(self, end: MissionEnd) -> None:
         """Send `end` to the agent until it sends its FinalReport, and acknowledge that."""
-        give_up = time.monotonic() + AGENT_FINAL_REPORT_S
-        while (now := time.monotonic()) < give_up and self._id in self._alive:
+        give_up = self._inbox.clock() + AGENT_FINAL_REPORT_S
+        while (now := self._inbox.clock()) < give_up and self._id in self._alive:
             if not self._is_taken(encode(end)):
                 self._inbox.say(f"no FinalReport of {self._id}: Zenoh does not take the MissionEnd")
                 return
             repeat = min(now + MISSION_END_REPEAT_S, give_up)
-            while (left := repeat - time.monotonic()) > 0.0:
+            while (left := repeat - self._inbox.clock()) > 0.0:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
                     self._alive.discard(arrival.source.robot)

@@ -15,7 +15,7 @@ any case, it ends at max_ticks.
 from __future__ import annotations
 
 import math
-import time
+from collections.abc import Callable
 
 from protocol.messages import Cause, Command, MissionEnd, RobotConfig, TickStart, Verdict
 from protocol.sweep_ticks import straight_ticks, sweepers_of_part, ticks_of_parts
@@ -30,7 +30,10 @@ PARTING_TICKS = 16
 class Ending:
     """The results of all robots of a mission, as far as they are known to one of them."""
 
-    def __init__(self, config: RobotConfig, max_ticks: int, timeout: float) -> None:
+    def __init__(
+        self, config: RobotConfig, max_ticks: int, timeout: float, clock: Callable[[], float]
+    ) -> None:
+        self._clock = clock
         self.verdict: Verdict | None = None
         """The robot's own result; None until it has one."""
         self._me = config.robot
@@ -52,8 +55,8 @@ class Ending:
         """The results that have been received, by robot."""
         self._complete: set[str] = set()
         """The robots that wait for no other one."""
-        self._heard = dict.fromkeys(self._others, time.monotonic())
-        """The time at which each robot was heard last, on the monotonic clock."""
+        self._heard = dict.fromkeys(self._others, self._clock())
+        """The time at which each robot was heard last, by the robot's clock."""
         self._tick_of: dict[str, int] = {}
         """The tick of the latest TickStart that has been received, by robot."""
         self._is_complete = False
@@ -73,7 +76,7 @@ class Ending:
         if message.robot not in self._others:
             return False
         robot = message.robot
-        self._heard[robot] = time.monotonic()
+        self._heard[robot] = self._clock()
         if message.tick < self._tick_of.get(robot, 0):
             return False
         self._tick_of[robot] = message.tick
@@ -109,7 +112,7 @@ class Ending:
 
     def _is_silent(self, robot: str) -> bool:
         """Return whether nothing has been heard of `robot` for the timeout."""
-        return time.monotonic() - self._heard[robot] > self._timeout
+        return self._clock() - self._heard[robot] > self._timeout
 
     def _is_lost(self, robot: str, tick: int) -> bool:
         """Return whether this robot does not wait for `robot` any more, of which it has heard nothing."""

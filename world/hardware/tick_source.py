@@ -25,7 +25,7 @@ class TickSource:
         self._before = config.group[: config.group.index(config.robot)]
         self._unheard_s = UNHEARD * tick_s
         self._heard: dict[str, float] = {}
-        """The time at which each of them was heard last, on the monotonic clock."""
+        """The time at which each of them was heard last, by the robot's clock."""
 
     @property
     def is_first(self) -> bool:
