@@ -45,6 +45,7 @@ from compose.scenario.json_schema import described
 from compose.scenario.kills import KillTable
 from compose.scenario.scenario_tables import (
     AnchorTable,
+    ClockTable,
     GroupTable,
     MissionTable,
     PlannerTable,
@@ -107,6 +108,7 @@ NAMES = {
     "PlannerTable": "table `[planner]`",
     "FaultTable": "`[[fault]]`",
     "KillTable": "`[[kill]]`",
+    "ClockTable": "`[[clock]]`",
     "AxisTable": "`[[axis]]`",
     "DrawTable": "`[[draw]]`",
     "StartsTable": "table `[starts]`",
@@ -415,6 +417,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "world-odometry-noise": partial(fields_of, WorldOdometryNoise),
     "fault": partial(fields_of, FaultTable),
     "kill": partial(fields_of, KillTable),
+    "clock": partial(fields_of, ClockTable),
     "sweep": partial(fields_of, SpecFile),
     "axis": partial(fields_of, AxisTable),
     "row": partial(fields_of, RowTable),

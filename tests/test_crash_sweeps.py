@@ -194,7 +194,7 @@ def test_a_command_that_restarts_no_process_refuses_a_scenario_with_kills(tmp_pa
     says = "mine.toml: kill: --in-process has no processes to kill"
     refused(tandem("run", "mine.toml", "--in-process", cwd=tmp_path), says)
     world = tandem("world", "mine.toml", "--listen", "tcp/127.0.0.1:7447", cwd=tmp_path)
-    refused(world, "mine.toml: kill: `tandem world` does not restart processes; use `tandem run`")
+    refused(world, "mine.toml: kill: `tandem world` starts no robots; use `tandem run`")
 
 
 # --- shipped sweeps --------------------------------------------------------------------------------

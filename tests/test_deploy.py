@@ -264,7 +264,7 @@ def test_what_containers_cannot_run_is_refused_in_one_line(tmp_path: Path) -> No
     link = tmp_path / "link.yaml"
     link.symlink_to("nowhere.yaml")
     for source, file, why in (
-        (kills, "new.yaml", "kill: a container is not killed by a scenario"),
+        (kills, "new.yaml", "kill: a scenario has no effect on containers"),
         (own, "new.yaml", "is not in the image, which has shipped planners only"),
         ("nothing", "new.yaml", "neither a file nor a shipped scenario"),
         ("random", "there.yaml", "there.yaml already exists; choose another file"),

@@ -32,6 +32,7 @@ OTHER: dict[str, Any] = {
     "max_ticks": 500,
     "planner.name": "paper",
     "kill": [{"who": "a", "tick": 3}],
+    "clock": [{"who": "a", "offset": 1.0}],
     "robot.attack": {"kind": "scale", "part": "orbit", "size": 0.9},
     "group.attack": {"kind": "scale", "part": "orbit", "size": 0.9},
     "team.attack": {"kind": "scale", "size": 0.9},

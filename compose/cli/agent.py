@@ -43,7 +43,9 @@ def main(options: argparse.Namespace) -> int:
         tell(f"{options.id}: {ended(end, end.tick)}")
         return status_of(end.outcome)
 
-    return participate(f"tandem agent {options.id}", take_part, (NoWorld,), launched=options.launched)
+    return participate(
+        f"tandem agent {options.id}", take_part, (NoWorld,), launched=options.launched, clock=options.clock
+    )
 
 
 def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:

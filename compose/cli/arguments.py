@@ -14,6 +14,7 @@ from compose.launch.class_loader import trust
 
 if TYPE_CHECKING:
     from compose.scenario.kills import Kill
+    from protocol.network.clock import Clock
 
 ENDPOINT_EXAMPLE = "tcp/127.0.0.1:7447"
 Value = TypeVar("Value")
@@ -147,3 +148,10 @@ def kill(text: str) -> Kill:
         return kills.parse(text)
     except BadKill as error:
         raise ArgumentTypeError(str(error)) from None
+
+
+def clock(text: str) -> Clock:
+    """Return the clock that a launcher has told with `ClockError.arguments`. Raises ArgumentTypeError."""
+    from protocol.network.clock import Clock  # noqa: PLC0415  # as above
+
+    return checked("a clock", Clock.told)(text)

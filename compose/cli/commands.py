@@ -33,6 +33,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--days": arguments.up_to(36_500),
     "--format": FIGURE_FORMATS,
     "--jobs": arguments.up_to(1000),
+    "--clock": arguments.clock,
     "--kill": arguments.kill,
     "--model": arguments.model,
     "--only": PICTURES,
@@ -182,6 +183,7 @@ PART_OF_RECORDING = """
 LAUNCHED = """
     --launched
     --kill KILL+
+    --clock CLOCK
 """
 """The flags of participants that another command launches."""
 

@@ -20,8 +20,9 @@ from world.scenario import Scenario
 def main(options: argparse.Namespace) -> int:
     """Write the compose file, and print the command that uses it."""
     found = setting(options.scenario)
-    if found.file.kill:
-        raise UserError(f"{options.scenario}: kill: a container is not killed by a scenario")
+    for name, tables in (("kill", found.file.kill), ("clock", found.file.clock)):
+        if tables:
+            raise UserError(f"{options.scenario}: {name}: a scenario has no effect on containers")
     scenario = found.scenario
     _check_code(options.scenario, scenario)
     place: Path = options.file

@@ -13,6 +13,7 @@ from compose.recording.recording_files import not_recorded
 from protocol.journal.journal_file import CannotRecord, CorruptJournal, OtherVersion
 from protocol.journal.resume import Retrace
 from protocol.network import session
+from protocol.network.clock import Clock
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Inbox, Interrupted
 
@@ -26,14 +27,16 @@ def participate(
     failures: tuple[type[Exception], ...],
     *,
     launched: bool = False,
+    clock: Clock | None = None,
 ) -> int:
     """Return the exit status of `body`, which gets an inbox; `owner` begins its messages.
 
-    `body` must call `stop_by_signal` before it runs the mission; until then, a signal raises an exception. A
-    process that is `launched` also stops with its launcher. An exception of `failures` is printed, and the
-    status is FAILED; after a signal it is STOPPED_STATUS. Raises UserError if a flag cannot be followed.
+    The inbox has `clock`. `body` must call `stop_by_signal` before it runs the mission; until then, a signal
+    raises an exception. A process that is `launched` also stops with its launcher. An exception of `failures`
+    is printed, and the status is FAILED; after a signal it is STOPPED_STATUS. Raises UserError if a flag
+    cannot be followed.
     """
-    inbox = Inbox(owner)
+    inbox = Inbox(owner, clock)
     if launched:
         stop_with_launcher(inbox)
     try:

@@ -26,6 +26,7 @@ from compose.terminal.text_width import tell
 from protocol.messages import Localised, MissionEnd, RobotConfig
 from protocol.motion import wrap
 from protocol.network import access_control, session
+from protocol.network.clock import Clock
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Inbox
 from protocol.output import say
@@ -37,7 +38,8 @@ LEAST_S = 0.1
 
 def main(options: argparse.Namespace) -> int:
     """Run one robot's hardware and its agent to the end of the mission; resume a recording in --out."""
-    scenario, config, rate, manoeuvre_s, made = hardware_robot(options, options.id)
+    scenario, config, rate, manoeuvre_s, error, made = hardware_robot(options, options.id)
+    began = time.monotonic()
     reached = reach(options, "world")
 
     def take_part(inbox: Inbox) -> int:
@@ -58,7 +60,8 @@ def main(options: argparse.Namespace) -> int:
                 journal=recording.journal,
             )
             recording.take_up(driver, options.driver, field)
-            end = _run(options, field, config, reached, folder, inbox)
+            told = error.arguments(began) if error is not None else []
+            end = _run(options, field, config, reached, folder, inbox, told)
         if not options.quiet and isinstance(field.verdict, Localised):
             pose = field.verdict.pose
             say(f"{options.id}: claims {pose.x:.9f} {pose.y:.9f} {wrap(pose.heading):+.9f} (m, m, rad)")
@@ -69,7 +72,9 @@ def main(options: argparse.Namespace) -> int:
         tell(f"{options.id}: {ended(end, end.tick)}")
         return status_of(end.outcome)
 
-    return participate(f"tandem robot {options.id}", take_part, (NoStart, ChildFailed))
+    return participate(
+        f"tandem robot {options.id}", take_part, (NoStart, ChildFailed), clock=Clock(error, began)
+    )
 
 
 def _run(
@@ -79,8 +84,9 @@ def _run(
     reached: Endpoints,
     folder: Path,
     inbox: Inbox,
+    clock: Sequence[str],
 ) -> MissionEnd:
-    """Run the mission with an agent process of its own, and return its end."""
+    """Run the mission with an agent process of its own, which is told `clock`, and return its end."""
     keys = (
         ["--keys", str(options.keys.resolve().parent / access_control.agent(options.id))]
         if options.keys
@@ -95,6 +101,7 @@ def _run(
             *("agent", options.id, "--connect", own, "--launched", "--run", field.run, *keys),
             *("--out", str(folder.resolve()), "--timeout", str(options.timeout)),
             *(["--fsync"] if options.fsync else []),
+            *clock,
             *([] if is_shipped(config.planner_name) else ["--planner", config.planner_name]),
         ]
         children.start(agent, *arguments)

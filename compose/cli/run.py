@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
@@ -24,6 +24,7 @@ from compose.scenario.run_settings import check_rate, run_name
 from compose.scenario.scenario_file import setting
 from compose.terminal.outcome import break_off, concluded, shown_live
 from protocol.journal.journal_file import CannotRecord
+from protocol.network.clock import ClockError
 from protocol.network.inbox import Inbox, Interrupted
 from world.scenario import Scenario
 
@@ -47,7 +48,7 @@ def main(options: argparse.Namespace) -> int:
         need("cryptography", extra="deploy")
     if options.in_process:
         return _in_process(options, scenario, kills)
-    return _as_processes(options, scenario, kills)
+    return _as_processes(options, scenario, kills, found.clocks)
 
 
 def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
@@ -78,7 +79,12 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         return _finish(options, finished, folder, "in-process", began, page, inbox)
 
 
-def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...]) -> int:
+def _as_processes(
+    options: argparse.Namespace,
+    scenario: Scenario,
+    kills: tuple[Kill, ...],
+    clocks: Mapping[str, ClockError],
+) -> int:
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")
     with (
@@ -97,6 +103,7 @@ def _as_processes(options: argparse.Namespace, scenario: Scenario, kills: tuple[
                     rate=options.rate,
                     timeout=options.timeout,
                     kills=kills,
+                    clocks=clocks,
                     keys=keys,
                     agents_journal=bool(options.out is not None or kills or page),
                     on_start=lambda: stop_by_signal(inbox),

@@ -51,7 +51,7 @@ def main(options: argparse.Namespace) -> int:
                 inbox.say(replayed(simulation.tick))
             return _run(options, simulation, links, folder, inbox)
 
-    return participate("tandem world", take_part, (NoRouter,), launched=options.launched)
+    return participate("tandem world", take_part, (NoRouter,), launched=options.launched, clock=options.clock)
 
 
 def _scenario(options: argparse.Namespace) -> Scenario:
@@ -59,10 +59,9 @@ def _scenario(options: argparse.Namespace) -> Scenario:
     if options.launched:
         return scenario_from_launcher()
     found = setting(options.scenario, options.fault, options.planner, options.planner_option)
-    if found.file.kill:
-        raise UserError(
-            f"{options.scenario}: kill: `tandem world` does not restart processes; use `tandem run`"
-        )
+    for name, tables in (("kill", found.file.kill), ("clock", found.file.clock)):
+        if tables:
+            raise UserError(f"{options.scenario}: {name}: `tandem world` starts no robots; use `tandem run`")
     return found.seeded(options.seed)
 
 

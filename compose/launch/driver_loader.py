@@ -11,6 +11,7 @@ from compose.launch.class_loader import named, trust
 from compose.scenario.run_settings import check_rate
 from compose.scenario.scenario_file import setting
 from protocol.messages import RobotConfig
+from protocol.network.clock import ClockError
 from protocol.spelling import did_you_mean
 from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
@@ -29,6 +30,8 @@ class HardwareRobot(NamedTuple):
     """The speed relative to real time."""
     manoeuvre_s: float
     """The wall time of a manoeuvre in s."""
+    clock: ClockError | None
+    """The error of the clock of the robot's processes."""
     driver: Callable[[], Driver]
     """Return the driver. Raises UserError for whatever its constructor raises."""
 
@@ -46,7 +49,9 @@ def hardware_robot(options: argparse.Namespace, robot: str) -> HardwareRobot:
         with user_code(f"{options.driver}: cannot be created:"):
             return maker(config, manoeuvre_s, **dict(options.option))
 
-    return HardwareRobot(scenario, config, rate, manoeuvre_s, driver)
+    return HardwareRobot(
+        scenario, config, rate, manoeuvre_s, setting(options.mission).clocks.get(robot), driver
+    )
 
 
 def driver_class(name: str) -> Callable[..., Driver]:

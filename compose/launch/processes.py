@@ -6,9 +6,11 @@ import os
 import random
 import signal
 import socket
+import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 
 from compose.errors import ENDED
 from compose.launch.forked import launcher
@@ -18,6 +20,7 @@ from compose.launch.supervisor import ChildFailed, Supervisor
 from compose.recording.kills_file import KILLS, add_kill
 from compose.scenario.kills import WORLD, Kill, taken
 from protocol import limits
+from protocol.network.clock import ClockError
 from protocol.network.inbox import Inbox
 from protocol.output import say
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
@@ -78,6 +81,7 @@ def run_mission(
     rate: float | None,
     timeout: float,
     kills: Sequence[Kill] = (),
+    clocks: Mapping[str, ClockError] = MappingProxyType({}),
     keys: Path | None = None,
     agents_journal: bool = True,
     on_start: Callable[[], object] = lambda: None,
@@ -85,7 +89,7 @@ def run_mission(
     """Run `scenario`, write its journals to `out`, and return the kills that did not happen.
 
     `rate` is the speed relative to real time, None for lockstep; `timeout` is in s. A process is killed at
-    its points in `kills`, and restarted.
+    its points in `kills`, and restarted. `clocks` are the errors of clocks, by robot or WORLD.
 
     Without `agents_journal`, only the world writes a journal. The outcome follows from that one alone, and
     with many robots the other files take a noticeable part of the run time.
@@ -98,6 +102,9 @@ def run_mission(
     """
     limits.need_files(CHILD_FILES * (1 + len(scenario.robots)) + SPARE_FILES, "a run as processes")
     arguments = _arguments(scenario, out, run, rate, timeout, keys, agents_journal=agents_journal)
+    since = time.monotonic()
+    for who, error in clocks.items():
+        arguments[WORLD if who == WORLD else f"agent {who}"] += error.arguments(since)
     mission = _Mission(scenario, arguments, kills, inbox, out if agents_journal else None)
     try:
         mission.start()

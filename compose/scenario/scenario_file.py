@@ -26,6 +26,7 @@ from protocol.attack import OF_THE_START
 from protocol.messages import Pairing, RobotConfig
 from protocol.mission import Anchor, Mission, noise_infeasibility, safety_infeasibility, too_small
 from protocol.motion import TAU, Pose
+from protocol.network.clock import ClockError
 from protocol.noise import with_profile
 from protocol.orbits import tick_budget
 from protocol.spelling import did_you_mean
@@ -94,6 +95,16 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
                 near = f"{', '.join(anyone)}{did_you_mean(kill.who, anyone)}"
                 raise BadKill(f"--kill: {kill.text}: there is no '{kill.who}'; there are {near}")
         return (*drawn(self.file.kill, seed, ids), *options)
+
+    @property
+    def clocks(self) -> dict[str, ClockError]:
+        """The errors of the clocks of robots and of the world, by name. Raises BadScenario."""
+        anyone = [*[robot.id for robot in self.file.robot], WORLD]
+        for i, one in enumerate(self.file.clock):
+            if one.who not in anyone:
+                near = f"{', '.join(anyone)}{did_you_mean(one.who, anyone)}"
+                raise BadScenario(f"clock[{i}].who: there is no '{one.who}'; there are {near}")
+        return {one.who: ClockError(one.offset, one.drift, one.jumps) for one in self.file.clock}
 
 
 def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
@@ -209,6 +220,7 @@ def template_of(table: Mapping[str, Any], faults: Sequence[str] = ()) -> Scenari
     found = ScenarioTemplate(file, _scenario(file, faults), "", tuple(faults))
     with within("", BadScenario):
         found.kills(file.seed)
+        _ = found.clocks
     return found
 
 

@@ -11,6 +11,7 @@ from compose.scenario.fault_syntax import FaultTable
 from compose.scenario.kills import KillTable
 from protocol.attack import Attack
 from protocol.mission import Mission, Options, PlannerName
+from protocol.network.clock import ClockError
 from protocol.units import NAME, Clearance, RobotId, Tick
 from world.world_models import ModelSpec
 from world.world_noise import WorldNoise
@@ -157,6 +158,13 @@ class GroupTable(_Table, frozen=True):
     """The tick from which on the robot r2 is dead, or the bounds between which it is drawn, both included."""
 
 
+class ClockTable(ClockError, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A `[[clock]]` table: the error of the clock of a robot's processes, or of the world."""
+
+    who: RobotId
+    """The id of a robot, or `world`."""
+
+
 LONGEST_NAME = 48
 """The maximum number of characters of the name of a scenario."""
 
@@ -188,3 +196,5 @@ class ScenarioFile(_Table, frozen=True):
     """Faults of the radio, applied to each report one after the other."""
     kill: list[KillTable] = []
     """Kills of processes. They are not part of the Scenario and do not appear in the recording."""
+    clock: list[ClockTable] = []
+    """Errors of clocks, in real time and in hardware mode. They are not part of the Scenario, either."""

@@ -28,7 +28,7 @@ FIELDS_OF_USERS: Mapping[User, Mapping[str, str]] = {
         "mission.": "sensing_range period max_speed max_turn_rate area frame diameter",
     },
     "robots": {
-        "": "name max_ticks planner kill robot.attack group.attack team.attack",
+        "": "name max_ticks planner kill clock robot.attack group.attack team.attack",
         "mission.": "accuracy confidence safety_distance tolerates survey",
         "mission.noise.": "range_bias pair_bias range_scale slow_sigma slow_time wheel_scale gyro_bias "
         "sigma_degrees survey_error range_delay strays odometry_strays",

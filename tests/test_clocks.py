@@ -1,0 +1,164 @@
+"""Clocks that are off, drift and jump do no harm, in hardware mode and in real time."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Mapping
+from pathlib import Path
+
+import pytest
+
+from compose.errors import BadScenario
+from compose.launch.virtual_hardware import HardwareEnd, run_hardware
+from compose.scenario.scenario_file import load, parse
+from protocol.messages import MissionEnd
+from protocol.network.clock import Clock, ClockError
+from tests import test_field
+from tests.commands import OVER, PAPER_1, tandem
+from tests.series import series
+from tests.test_field import ASSURED, both_have_ended, pair
+from world.hardware.bridge import Field
+from world.scenario import Scenario
+
+
+def errors(scenario: Scenario, seed: int) -> dict[str, ClockError]:
+    """Return bad clocks of all robots: off by 1 s, with a drift of 100 ppm, and up to three jumps of 10 s."""
+    found, draw = {}, random.Random(f"{seed}/clocks")
+    for robot in scenario.robots:
+        jumps = [(draw.uniform(0.0, 40.0), draw.choice((-10.0, 10.0))) for _ in range(draw.randrange(4))]
+        found[robot.id] = ClockError(draw.choice((-1.0, 1.0)), draw.choice((-100.0, 100.0)), tuple(jumps))
+    return found
+
+
+def run(name: str, seed: int, folder: Path) -> HardwareEnd:
+    folder.mkdir()
+    scenario = load(name, seed=seed)
+    return run_hardware(scenario, folder, errors(scenario, seed))
+
+
+def all_well(end: HardwareEnd, robots: int) -> bool:
+    """Return whether every robot is localised, no claim is wrong and no process has failed."""
+    outcomes = [one.outcome for one in end.ends.values()]
+    return outcomes == ["localised"] * robots and not end.wrong and not end.failures
+
+
+def files(folder: Path) -> Mapping[str, bytes]:
+    return {path.name: path.read_bytes() for path in folder.iterdir()}
+
+
+# --- the clock ----------------------------------------------------------------------------------------
+
+
+def test_a_clock_shows_its_error_and_never_goes_back() -> None:
+    true = {"now": 500.0}
+    clock = Clock(ClockError(1.0, 100.0, ((10.0, 5.0), (20.0, -7.0))), 500.0, lambda: true["now"])
+    shown = []
+    for now in (500.0, 509.0, 510.0, 519.0, 520.0, 521.0):
+        true["now"] = now
+        shown.append(clock() - 500.0)
+    assert shown == pytest.approx([1.0, 10.0009, 16.001, 25.0019, 25.0019, 26.002])
+
+
+# --- hardware mode in virtual time --------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("case", series([("random", 5), ("random", 36), ("noisy", 0), ("room", 1)]))
+def test_robots_with_bad_clocks_localise_and_write_the_same_bytes_again(
+    case: tuple[str, int], tmp_path: Path
+) -> None:
+    name, seed = case
+    ends = [run(name, seed, tmp_path / one) for one in ("one", "other")]
+    assert all_well(ends[0], len(load(name, seed=seed).robots))
+    assert ends[0] == ends[1]
+    assert files(tmp_path / "one") == files(tmp_path / "other") != {}
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("name", ["random", "noisy", "random-group", "relative"])
+def test_robots_with_bad_clocks_are_never_wrong_or_stuck(name: str, tmp_path: Path) -> None:
+    for seed in range(20):
+        end = run(name, seed, tmp_path / str(seed))
+        assert all_well(end, len(load(name, seed=seed).robots)), (seed, end)
+
+
+def test_a_manoeuvre_that_a_jump_seems_to_end_is_over_before_the_next_reading(tmp_path: Path) -> None:
+    """Otherwise the ranges are of a moving robot, which the peer finds inconsistent."""
+    scenario = load("random", seed=36)
+    for i in range(8):
+        folder = tmp_path / str(i)
+        folder.mkdir()
+        clock = ClockError(jumps=((12.5 + 0.2 * i, 10.0),))
+        assert all_well(run_hardware(scenario, folder, {"a": clock}), 2)
+
+
+@pytest.mark.parametrize("at", series([10.3, 5.0, 12.0, 17.4]))
+def test_a_jump_that_is_longer_than_the_timeout_is_no_silence_of_others(at: float, tmp_path: Path) -> None:
+    clock = ClockError(jumps=((at, 40.0),))
+    assert all_well(run_hardware(load("random", seed=36), tmp_path, {"a": clock}), 2)
+
+
+def test_clocks_may_start_anywhere(tmp_path: Path) -> None:
+    """Also below zero, where a time of 0 s is in the future."""
+    scenario, found = load("random", seed=3), []
+    for offset in (0.0, -1e3, 1e6):
+        folder = tmp_path / str(offset)
+        folder.mkdir()
+        clocks = {one.id: ClockError(offset) for one in scenario.robots}
+        found.append(run_hardware(scenario, folder, clocks).ends)
+    assert found[0] == found[1] == found[2]
+
+
+def test_a_clock_in_place_of_the_tick_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    real, began = Field._play_tick, dict[str, float]()
+
+    def by_clock(field: Field) -> MissionEnd | None:
+        now = field._inbox.clock()
+        passed = now - began.setdefault(field._id, now)
+        field._tick = round(passed / field._tick_s) - 1
+        return real(field)
+
+    monkeypatch.setattr(Field, "_play_tick", by_clock)
+    scenario = load("random", seed=36)
+    assert all_well(run_hardware(scenario, tmp_path), 2)
+    began.clear()
+    (tmp_path / "bad").mkdir()
+    assert not all_well(run_hardware(scenario, tmp_path / "bad", {"a": ClockError(jumps=((8.0, 10.0),))}), 2)
+
+
+# --- the scenario's field -----------------------------------------------------------------------------
+
+CLOCKS = """
+[[clock]]
+who = "a"
+offset = 1.0
+drift = -100.0
+jumps = [[3.0, 10.0], [4.5, -10.0]]
+[[clock]]
+who = "b"
+jumps = [[4.0, -10.0]]
+"""
+
+
+def test_two_robots_whose_clocks_jump_localise_as_processes_in_hardware_mode(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(test_field, "ASSURED", ASSURED.replace("= 120", "= 240") + CLOCKS)
+    with pair(tmp_path) as robots:
+        both_have_ended(tmp_path, robots)
+
+
+@pytest.mark.long
+def test_robots_whose_clocks_jump_localise_in_real_time(tmp_path: Path) -> None:
+    world = '[[clock]]\nwho = "world"\njumps = [[3.0, 10.0], [4.0, -10.0]]\n'
+    (tmp_path / "it.toml").write_text(ASSURED + CLOCKS + world)
+    ended = tandem("run", tmp_path / "it.toml", "--rate", "10", "--out", tmp_path / "out")
+    assert ended.status in OVER, ended.err
+    assert tandem("audit", tmp_path / "out").status == 0
+
+
+def test_a_clock_of_nobody_is_a_mistake(tmp_path: Path) -> None:
+    with pytest.raises(BadScenario, match=r"^it: clock\[0\]\.who: there is no 'c'; there are a, b, world"):
+        parse(PAPER_1 + '[[clock]]\nwho = "c"\n', "it")
+    (tmp_path / "it.toml").write_text(PAPER_1 + CLOCKS)
+    refused = tandem("world", tmp_path / "it.toml", "--listen", "tcp/127.0.0.1:0")
+    assert (refused.status, "clock: `tandem world` starts no robots" in refused.err) == (2, True)
