@@ -28,6 +28,7 @@ from compose.sweep.hunt.exploration import FoundBreach, Hunt
 from compose.sweep.hunt.mutation import fault_lines
 from protocol.journal.journal_file import Journal
 from world import scenario, tick
+from world.hardware import bridge
 
 BUDGET_S = 600.0
 """The processor time in s of 5 minutes on two cores."""
@@ -135,6 +136,17 @@ def clock() -> None:
     )
 
 
+def counted() -> None:
+    """A driver counts ticks by its clock."""
+    edited(
+        bridge.Field,
+        "_play_tick",
+        "self._tick += 1",
+        "began = vars(self).setdefault('began', self._inbox.clock())\n"
+        "    self._tick = round((self._inbox.clock() - began) / self._tick_s)",
+    )
+
+
 def case() -> None:
     """The ids of robots are compared without their case."""
     edited(scenario.Scenario, "robot", "spec.id == robot", "spec.id.lower() == robot.lower()")
@@ -155,6 +167,7 @@ MUTANTS: dict[Callable[[], None], str] = {
     lost: "random",
     bound: "random-group",
     clock: "random",
+    counted: "random",
     case: "random",
     triangle: "random",
 }

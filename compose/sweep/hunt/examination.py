@@ -9,7 +9,7 @@ from typing import Any, cast
 import msgspec
 
 from compose.errors import UserError
-from compose.launch import in_process, virtual_processes
+from compose.launch import in_process, virtual_hardware, virtual_processes
 from compose.recording.run import Run, of_frames
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
@@ -17,6 +17,7 @@ from compose.sweep.hunt.coverage import WatchedPlanner, reached
 from compose.sweep.hunt.invariants import Breach, breaches
 from compose.sweep.hunt.mutation import Clues
 from protocol.journal.journal_file import MemoryJournal, packed
+from protocol.network.clock import ClockError
 from protocol.wire import EncodedMessages
 from world.scenario import Scenario
 
@@ -34,16 +35,16 @@ class Examined(msgspec.Struct, frozen=True):
     """The reason why the input was not run; None if it was."""
 
 
-def scenario_of(table: dict[str, Any]) -> tuple[Scenario, tuple[Kill, ...]]:
-    """Return the scenario and the kills of `table`. Raises UserError."""
+def scenario_of(table: dict[str, Any]) -> tuple[Scenario, tuple[Kill, ...], dict[str, ClockError]]:
+    """Return the scenario, the kills and the errors of clocks of `table`. Raises UserError."""
     template = validate(table, "the input")
-    return template.scenario, template.kills(template.scenario.seed)
+    return template.scenario, template.kills(template.scenario.seed), template.clocks
 
 
 def examined(table: dict[str, Any]) -> Examined:
     """Run the input `table`, in one process and as virtual processes, and examine the run."""
     try:
-        scenario, kills = scenario_of(table)
+        scenario, kills, clocks = scenario_of(table)
     except UserError as error:
         return Examined(refused=str(error))
     if scenario.max_ticks * len(scenario.robots) > MOST_TICKS:
@@ -57,7 +58,7 @@ def examined(table: dict[str, Any]) -> Examined:
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
     run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
-    again = _again(scenario, kills, sinks)
+    again = _again(scenario, kills, clocks, sinks)
     found, moments = reached(run)
     every = [*again, *breaches(run, replayed=not again)]
     ids = tuple([one.id for one in scenario.robots])
@@ -72,10 +73,23 @@ def _task(run: Run, kill: Kill) -> str:
     return command.task if command is not None else "over"
 
 
-def _again(scenario: Scenario, kills: tuple[Kill, ...], sinks: dict[str, MemoryJournal]) -> list[Breach]:
-    """Return how a run as virtual processes differs from the journals in `sinks`."""
+def _again(
+    scenario: Scenario,
+    kills: tuple[Kill, ...],
+    clocks: dict[str, ClockError],
+    sinks: dict[str, MemoryJournal],
+) -> list[Breach]:
+    """Return how a run as virtual processes differs from `sinks`, or fails in hardware mode with `clocks`."""
+    if clocks and not (kills or scenario.faults or scenario.deaths):
+        with tempfile.TemporaryDirectory(prefix="tandem-hunt-") as folder:
+            hardware = virtual_hardware.run_hardware(scenario, Path(folder), clocks)
+        failed = [one.causes[0].text or "" for one in hardware.ends.values() if one.outcome == "failed"]
+        if failed or hardware.failures:
+            return [Breach("a process dies", "; ".join((*hardware.failures, *failed)))]
+        if hardware.wrong and not any(one.attack for one in scenario.robots):
+            return [Breach("a wrong claim", f"in hardware mode: {hardware.wrong[0].robots[0]}")]
     with tempfile.TemporaryDirectory(prefix="tandem-hunt-") as folder:
-        ended = virtual_processes.run_mission(scenario, Path(folder), kills)
+        ended = virtual_processes.run_mission(scenario, Path(folder), kills, clocks)
         if ended.failures:
             return [Breach("a process dies", "; ".join(ended.failures))]
         return [

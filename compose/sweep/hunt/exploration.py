@@ -121,7 +121,7 @@ class Hunt:
         due = self.runs // PROCESSES_EACH > (self.runs - len(inputs)) // PROCESSES_EACH
         for table in [one for one in inputs if one.get("kill")] if due else ():
             try:
-                scenario, kills = scenario_of(table)
+                scenario, kills, _ = scenario_of(table)
                 self.processes += 1
                 with redirect_stderr(StringIO()):  # what it says about each kill
                     differing = as_processes(scenario, audit=False, kills=kills).differing

@@ -139,6 +139,16 @@ def _kill(table: Table, known: Clues, draw: random.Random) -> Table | None:
     return table
 
 
+def _clock(table: Table, known: Clues, draw: random.Random) -> Table:
+    """Give a process another clock. A mission takes about 1 s in lockstep, and 60 s in hardware mode."""
+    last = draw.choice((1.0, 60.0))
+    jumps = [[last * draw.random(), draw.choice((-10.0, 0.5, 10.0))] for _ in range(draw.randrange(4))]
+    error: Table = {"offset": draw.choice((-1.0, 0.0, 1.0)), "drift": draw.choice((-100.0, 100.0))}
+    who: Any = draw.choice([*known.robots, WORLD])
+    others = [one for one in table.get("clock", []) if one["who"] != who]
+    return {**table, "clock": [*others, {"who": who, "jumps": jumps} | error]}
+
+
 def _attack(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     """Let a robot report false data."""
     kind = draw.choice(get_args(attack.Kind))
@@ -256,6 +266,7 @@ MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float]
     _start: 2.0,
     _fault: 3.0,
     _kill: 3.0,
+    _clock: 0.5,
     _attack: 1.0,
     _death: 0.7,
     _noise: 0.2,
@@ -271,7 +282,7 @@ MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float]
 
 def simpler(table: Mapping[str, Any]) -> Iterator[Table]:
     """Yield `table` without one of its parts that are not needed, and with smaller ones in their place."""
-    for name in ("fault", "kill"):
+    for name in ("fault", "kill", "clock"):
         size = len(table.get(name, []))
         while size:  # first all, then fewer of them
             for i in range(0, len(table[name]), size):
@@ -314,7 +325,7 @@ def _with(table: Mapping[str, Any], *way: Any) -> Table:
 
 def fault_lines(table: Mapping[str, Any], source: Mapping[str, Any]) -> int:
     """Return the number of faults, kills, attacks, deaths and other fields by which `table` differs."""
-    lists: Sequence[str] = ("fault", "kill")
+    lists: Sequence[str] = ("fault", "kill", "clock")
     count = sum([sum([one not in source.get(name, []) for one in table.get(name, [])]) for name in lists])
     before = {one["id"]: one for one in source.get("robot", [])}
     for robot in table.get("robot", []):
