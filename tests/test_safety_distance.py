@@ -89,9 +89,10 @@ def test_none_comes_nearer_under_noise(seed: int) -> None:
 
 
 @settings(max_examples=20)
-@given(st.integers(1, 10**6), st.floats(0.0, 0.9))
-def test_none_comes_nearer_however_many_reports_are_lost(seed: int, loss: float) -> None:
-    scenario = load("random", seed=seed, faults=[f"a<->b: loss={loss:.3f}", "b->a: delay=0..3"])
+@given(st.integers(1, 10**6), st.floats(0.0, 0.9), st.integers(0, 8))
+def test_none_comes_nearer_however_many_reports_are_lost_or_late(seed: int, loss: float, least: int) -> None:
+    faults = [f"a<->b: loss={loss:.3f}", f"b->a: delay={least}..{least + 3}"]
+    scenario = load("random", seed=seed, faults=faults)
     recording = run_mission(replace(scenario, mission=replace(scenario.mission, safety_distance=SAFE)))
     assert recording.end is not None
     assert recording.end.outcome == "localised"

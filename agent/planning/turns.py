@@ -34,9 +34,15 @@ def begun(state: RobotState) -> RobotState:
 
 
 def _may_drive_straight(state: RobotState) -> bool:
-    """Return whether a knows that b stands, and is far enough from b to drive straight on."""
-    now = bool(state.mutual) and state.mutual[-1].tick == state.tick == state.peer_state.peer.through
-    return now and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
+    """Return whether a knows that b stands, and is far enough from b to drive straight on.
+
+    Once b stands, it does so until a rests; a report that says so may be late.
+    """
+    if not state.mutual or state.mutual[-1].tick != state.tick:
+        return False
+    peer = state.peer_state
+    stands = peer.peer.through == state.tick or peer.state == tasks.Standing.name
+    return stands and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
 
 
 def after_last_manoeuvre(state: RobotState, task: tasks.LastManoeuvre | tasks.Returning) -> RobotState:
