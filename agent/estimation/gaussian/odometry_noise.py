@@ -16,7 +16,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.elementary import cos, product, sin, tan
+from agent.estimation.elementary import cos, sin, tan
 from agent.estimation.smoother import SLIGHT
 from protocol.noise import Noise, VelocityNoise
 
@@ -324,7 +324,7 @@ def spread(model: OdometryNoiseModel, rows: Projection) -> tuple[Array, Array]:
     """Return factors of the covariance (m^2) of N rows from white odometry noise; shape (..., 3, N) each.
 
     Element (i, j) of the covariance is the product of column i of the first and column j of the second, if
-    row i is not earlier than row j; see `symmetric`.
+    row i is not earlier than row j.
     """
     if model.sums is None:
         return rows.weights, np.zeros(rows.weights.shape)
@@ -334,12 +334,6 @@ def spread(model: OdometryNoiseModel, rows: Projection) -> tuple[Array, Array]:
 
 MATRIX = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
 """The places in `OdometryNoiseModel.sums` of the elements of the matrix of a tick."""
-
-
-def symmetric(left: Array, right: Array, ticks: Ticks) -> Array:
-    """Return the covariance of rows from its factors (see `spread`), (..., n, N) each; shape (..., N, N)."""
-    both = product(left.mT, right)
-    return np.where(ticks.tick[:, None] >= ticks.tick, both, both.mT)
 
 
 class Errors(NamedTuple):

@@ -33,7 +33,6 @@ from agent.estimation.gaussian.odometry_noise import (
     constant_effects,
     corrected,
     spread,
-    symmetric,
     wander,
 )
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
@@ -150,7 +149,8 @@ def _encounter(own: Fit, base: int, ticks: tuple[int, ...]) -> Encounter:
         effects, patterns = constant_effects(model, rows)[:-1], of.patterns[0].copy()
         patterns[:, :, :since] = 0.0
         odometry = (model, rows, effects, patterns)
-        covariance = of_anchor + symmetric(*spread(model, rows), rows.ticks) + product(effects.T, effects)
+        left, right = spread(model, rows)
+        covariance = of_anchor + product(left.mT, right) + product(effects.T, effects)
     variances, axes = eigh(covariance)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     inverse = axes * np.where(sigmas > LEAST_OFFSET, 1.0 / np.maximum(sigmas, LEAST_OFFSET), 0.0)
