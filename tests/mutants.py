@@ -1,8 +1,8 @@
 """Defects that a hunt must find: `python -m tests.mutants [NAME ...] [--cpu S]`.
 
-Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used
-S seconds of processor time: with the guide, and beside it by chance alone. One line each says after how many
-seconds and runs it was found, and how small the input is.
+Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used S
+seconds of processor time: with the guide, and beside it by chance alone. A table says after how many seconds
+and runs each was found, and how small the input is.
 """
 
 from __future__ import annotations
@@ -17,8 +17,10 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from agent.estimation import exact_estimator
-from agent.estimation.gaussian import odometry_noise, placement_guesses
+from agent.estimation.gaussian import inference
 from agent.peer import peer_state
 from agent.planning import accuracy_seeking
 from agent.process import node
@@ -153,9 +155,8 @@ def case() -> None:
 
 
 def triangle() -> None:
-    """A covariance is not symmetrised."""
-    edited(odometry_noise, "symmetric", "both, both.mT", "both, 0.0")
-    vars(placement_guesses)["symmetric"] = odometry_noise.symmetric
+    """The lower triangle of a covariance is read in the place of the upper one."""
+    inference.TRIANGLE = np.tril_indices(3)
 
 
 MUTANTS: dict[Callable[[], None], str] = {
@@ -210,7 +211,9 @@ def main(arguments: list[str]) -> int:
     options = parser.parse_args(arguments)
     chosen = {one: source for one, source in MUTANTS.items() if one.__name__ in (options.name or _names())}
     missed = 0
+    print("| mutant | guided | by chance |\n| --- | --- | --- |")
     for mutant, source in chosen.items():
+        print(f"| {mutant.__name__}", end="", flush=True)
         for guided in (True,) if options.guided_only else (True, False):
             child, ours = os.pipe()
             pid = os.fork()
@@ -222,7 +225,8 @@ def main(arguments: list[str]) -> int:
             with os.fdopen(child) as text:
                 says = text.read()
             missed += guided and not says.startswith("found")
-            print(f"{mutant.__name__:10} {'guided' if guided else 'chance'}: {says}", flush=True)
+            print(f" | {says}", end="", flush=True)
+        print(" |", flush=True)
     return 0 if 10 * missed <= len(chosen) else 1
 
 

@@ -203,6 +203,15 @@ class Scenario(
         return None if spec is None else model_class(spec.model, RANGE_MODELS)(**spec.options)
 
     @cached_property
+    def attacked(self) -> frozenset[str]:
+        """The robots that measure the link whose ranges are attacked: two, or one with an anchor."""
+        spec, ids = self.range_model, [one.id for one in self.robots]
+        link = str(spec.options.get("link")) if spec is not None and spec.model == "attacked" else ""
+        pairs, ranged = self.sensors.mutual.items(), self.sensors.anchors.items()
+        found = [{ids[i], ids[j]} for (i, j), one in pairs if link == f"mutual/{one.robot}"]
+        return frozenset(*found, *[{robot} for (robot, _), one in ranged if link == f"anchor/{one.robot}"])
+
+    @cached_property
     def radio(self) -> RadioModel[Any] | None:
         """The radio model; None if all reports are delivered. Raises LookupError like `ranging`."""
         spec = self.radio_model

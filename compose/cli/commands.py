@@ -32,7 +32,6 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--confidence": arguments.confidence,
     "--days": arguments.up_to(36_500),
     "--format": FIGURE_FORMATS,
-    "--jobs": arguments.up_to(1000),
     "--clock": arguments.clock,
     "--kill": arguments.kill,
     "--model": arguments.model,
@@ -271,7 +270,7 @@ COMMANDS = (
         f"""{SCENARIO}
         --minutes M = 5: wall time of the search in minutes [default: %(default)g]
         | --runs N: number of runs instead, in batches of 16, after which it ends
-        --jobs N: processes in which missions run, 1 to 1000 [default: one per core]
+        --workers N: worker processes, 1 to 1000 [default: one per core]
         --seed N = 0: seed of all draws, 0 to 2^63 - 1 [default: %(default)s]
         --out FILE: scenario file that is written if something is found [default: hunt-SCENARIO.toml]
         -q --quiet: print only the results

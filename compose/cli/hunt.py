@@ -30,7 +30,7 @@ def main(options: argparse.Namespace) -> int:
     out: Path = options.out if options.out is not None else Path(f"hunt-{Path(options.scenario).stem}.toml")
     if out.exists():
         raise UserError(f"--out: {out} already exists; choose another file")
-    hunt = Hunt(options.scenario, options.seed, options.jobs or os.cpu_count() or 1)
+    hunt = Hunt(options.scenario, options.seed, options.workers or os.cpu_count() or 1)
     began = told = time.monotonic()
 
     def is_over(hunt: Hunt) -> bool:

@@ -14,7 +14,7 @@ from compose.recording.run import Run, of_frames
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
 from compose.sweep.hunt.coverage import WatchedPlanner, reached
-from compose.sweep.hunt.invariants import Breach, breaches
+from compose.sweep.hunt.invariants import Breach, bounded, breaches
 from compose.sweep.hunt.mutation import Clues
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.clock import ClockError
@@ -63,6 +63,7 @@ def examined(table: dict[str, Any]) -> Examined:
     every = [*again, *breaches(run, replayed=not again)]
     ids = tuple([one.id for one in scenario.robots])
     found |= seen | {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
+    found |= {f"bound, used: {10 * one.ticks // one.bound} of 10" for one in bounded(run) if one.ticks}
     return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments))
 
 

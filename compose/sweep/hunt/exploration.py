@@ -20,7 +20,7 @@ from compose.sweep.hunt.mutation import Clues, Table, is_noisy, mutated, seeds, 
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
-"""The number of inputs that are drawn from one state of the corpus, so that the jobs do not matter."""
+"""The number of inputs that are drawn from one state of the corpus, so that the workers do not matter."""
 HANG_S = 600.0
 """The time in s after which an input counts as one that never ends."""
 MOST_TRIES = 100
@@ -64,11 +64,11 @@ class FoundBreach(NamedTuple):
 class Hunt:
     """The state of a hunt. It is the same for the same source, seed and number of runs."""
 
-    def __init__(self, source: str, seed: int, jobs: int, *, guided: bool = True) -> None:
+    def __init__(self, source: str, seed: int, workers: int, *, guided: bool = True) -> None:
         """`guided` is whether inputs that reach something new are kept; otherwise, chance alone decides."""
         self.seeds = seeds(source)
         """The inputs with which the hunt begins, the source first."""
-        self._seed, self._jobs, self._guided = seed, jobs, guided
+        self._seed, self._workers, self._guided = seed, workers, guided
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
         self.seen: set[str] = set()
@@ -81,14 +81,14 @@ class Hunt:
 
         `is_over` is asked after each batch.
         """
-        with _workers(self._jobs) as examine:
+        with _pool(self._workers) as examine:
             for number in count():
                 inputs = self._batch(number)
                 for table, result in zip(inputs, examine(inputs), strict=True):
                     self.runs += 1
                     self.refused += result.refused is not None
                     if result.breaches:
-                        return _shrunk(table, result.breaches[0], self.runs, self._jobs, examine)
+                        return _shrunk(table, result.breaches[0], self.runs, self._workers, examine)
                     self._keep(table, result)
                 if (found := self._as_processes(inputs)) is not None or is_over(self):
                     return found
@@ -139,14 +139,14 @@ class Hunt:
 Examine = Callable[[Sequence[Table]], Iterator[Examined]]
 
 
-def _shrunk(table: Table, breach: Breach, runs: int, jobs: int, examine: Examine) -> FoundBreach:
+def _shrunk(table: Table, breach: Breach, runs: int, workers: int, examine: Examine) -> FoundBreach:
     """Return the smallest input that breaks the same invariant, as far as MOST_TRIES runs show it."""
     left, tries = list(simpler(table)), 0
     while left and tries < MOST_TRIES:
-        size = min(jobs, MOST_TRIES - tries)
+        size = min(workers, MOST_TRIES - tries)
         tried, left = left[:size], left[size:]
         for smaller, result in zip(tried, examine(tried), strict=True):
-            tries += 1
+            tries += result.refused is None
             same = next((one for one in result.breaches if one.kind == breach.kind), None)
             if same is not None:
                 table, breach, left = smaller, same, list(simpler(smaller))
@@ -155,9 +155,9 @@ def _shrunk(table: Table, breach: Breach, runs: int, jobs: int, examine: Examine
 
 
 @contextmanager
-def _workers(jobs: int) -> Iterator[Examine]:
-    """Yield a function that examines inputs in `jobs` processes, forked from this one, in their order."""
-    pool = multiprocessing.get_context("fork").Pool(jobs, _begin)
+def _pool(workers: int) -> Iterator[Examine]:
+    """Yield a function that examines inputs in `workers` processes, forked from this one, in their order."""
+    pool = multiprocessing.get_context("fork").Pool(workers, _begin)
 
     def examine(tables: Sequence[Table]) -> Iterator[Examined]:
         for one in [pool.apply_async(examined, (table,)) for table in tables]:

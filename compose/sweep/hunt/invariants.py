@@ -2,13 +2,17 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from itertools import combinations
+from typing import NamedTuple
 
 import msgspec
 import numpy as np
 
 from agent.estimation.claim import is_definite
 from compose.audit import agent_rules, rules
+from compose.recording.closest_approach import nearest
 from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run
 from compose.sweep.trial import Trial, row
@@ -40,13 +44,15 @@ def breaches(run: Run, *, replayed: bool) -> Iterator[Breach]:
     for one in rules.audit_run(run, left).violations:
         if one.rule != "claim" or _must_be_right(run.scenario):
             yield Breach(f"audit: {one.rule}", one.line)
-    for check in (blamed, unfinished, late, truth_lost, forgotten, kept, indefinite):
+    for check in (blamed, unfinished, late, near, truth_lost, forgotten, kept, indefinite):
         yield from check(run)
 
 
 def _must_be_right(scenario: Scenario) -> bool:
     """Return whether claims must be right: more attackers than are tolerated can mislead noisy robots."""
     attackers = sum([one.attack is not None for one in scenario.robots])
+    if scenario.range_model is not None:  # an attacked link of two robots counts as one of them
+        attackers += 1 if len(scenario.attacked) == 2 else scenario.tolerates + 1
     return scenario.mission.noise.exact or attackers <= scenario.tolerates
 
 
@@ -56,12 +62,29 @@ def _guaranteed(scenario: Scenario) -> bool:
     fair = fair and not any(one.partition and not (one.ticks or one.contact_ticks) for one in scenario.faults)
     exact = scenario.mission.noise.exact and scenario.world_noise is None and scenario.range_model is None
     honest = all(one.attack is None for one in scenario.robots) and not scenario.deaths
+    if scenario.mission.safety_distance and min(_apart(scenario)) <= scenario.mission.sensing_range:
+        return False  # robots that begin in range of each other may block each other
     return fair and exact and honest and scenario.planner_name == "assured" and scenario.radio_model is None
+
+
+def _apart(scenario: Scenario) -> list[float]:
+    """Return the distances in m at the start of the robots that may range each other."""
+    starts = [one.start for one in scenario.robots]
+    return [math.dist((a.x, a.y), (b.x, b.y)) for a, b in combinations(starts, 2)] or [math.inf]
+
+
+def near(run: Run) -> Iterator[Breach]:
+    """Robots with exact sensors keep the safety distance, unless they begin nearer."""
+    scenario, least = run.scenario, run.scenario.mission.safety_distance
+    if least and scenario.mission.noise.exact and scenario.world_noise is None:
+        found = nearest(run)
+        if found is not None and found < min(least, *_apart(scenario)) - TRUTH_M:
+            yield Breach("safety distance", f"two robots come as near as {found:.4g} m, not {least:g}")
 
 
 def blamed(run: Run) -> Iterator[Breach]:
     """No robot finds an honest peer inconsistent."""
-    honest = {one.id for one in run.scenario.robots if one.attack is None}
+    honest = {one.id for one in run.scenario.robots if one.attack is None} - run.scenario.attacked
     for robot, agent in run.agents.items():
         for step in agent.steps:
             for contact, framed in zip(step.observation.contacts, step.reports, strict=False):
@@ -79,21 +102,37 @@ def unfinished(run: Run) -> Iterator[Breach]:
         yield Breach("unfinished", f"tick {run.end.tick}: {run.end.outcome}: {run.end.causes}")
 
 
-def late(run: Run) -> Iterator[Breach]:
-    """The computed bounds hold: of the meeting of a pair, of all meetings of a group, and of a team."""
+class Bounded(NamedTuple):
+    """Something for which a bound is computed."""
+
+    what: str
+    """The end of the meeting of a pair, or the robot that is localised."""
+    ticks: int | None
+    """The ticks that it took; None if it did not happen."""
+    bound: int
+
+
+def bounded(run: Run) -> Iterator[Bounded]:
+    """Yield what has a bound in `run`: the meeting of a pair, all meetings of a group, and of a team."""
     scenario = run.scenario
     if not _guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
         return
     if scenario.in_pairs:
         found = row(Trial(0, 0, scenario, processes=False), run, 0.0)
         met, orbiting, bound = found.meeting_tick, found.orbiting_tick, found.t_max_ticks
-        if met is not None and orbiting is not None and bound is not None and met - orbiting > bound:
-            yield Breach("bound", f"the robots meet {met - orbiting} ticks after both orbit, bound {bound}")
-    results = [(one.visited, one.localised_tick, one.bound_ticks) for one in meeting_results(run)]
-    results += [(one.robot, one.localised_tick, one.bound_ticks) for one in search_results(run)]
-    for robot, tick, bound in results:
-        if tick is None or tick > bound:
-            yield Breach("bound", f"{robot} is localised in tick {tick}, bound {bound}")
+        if met is not None and orbiting is not None and bound is not None:
+            yield Bounded("meeting", met - orbiting, bound)
+    for one in meeting_results(run):
+        yield Bounded(one.visited, one.localised_tick, one.bound_ticks)
+    for other in search_results(run):
+        yield Bounded(other.robot, other.localised_tick, other.bound_ticks)
+
+
+def late(run: Run) -> Iterator[Breach]:
+    """The computed bounds hold."""
+    for one in bounded(run):
+        if one.ticks is None or one.ticks > one.bound:
+            yield Breach("bound", f"{one.what}: {one.ticks} ticks, bound {one.bound}")
 
 
 def truth_lost(run: Run) -> Iterator[Breach]:
@@ -128,11 +167,17 @@ def forgotten(run: Run) -> Iterator[Breach]:
 
 def kept(run: Run) -> Iterator[Breach]:
     """The world keeps the claims that robots have made and not withdrawn, and no others."""
-    claims = {robot for robot, one in run.verdicts().items() if isinstance(one, Localised)}
     dead = {one.robot for one in run.scenario.deaths}
-    for robot in run.robots:
-        if (robot in claims) != (run.standing_claim(robot) is not None) and robot not in dead:
-            yield Breach("withdrawn claim", f"{robot} {'has no' if robot in claims else 'has a'} claim")
+    after = [*[tick.world.verdicts for tick in run.ticks[1:]], run.verdicts()]
+    for tick, verdicts in zip(run.ticks, after, strict=True):
+        for robot, command in tick.commands.items():
+            claims, is_kept = (isinstance(one, Localised) for one in (command.verdict, verdicts.get(robot)))
+            if claims != is_kept and robot not in dead and not run.scenario.in_pairs:
+                what = (
+                    f"tick {tick.truth.tick}: the world keeps {'the' if is_kept else 'no'} claim of {robot}"
+                )
+                yield Breach("withdrawn claim", what)
+                return
 
 
 def indefinite(run: Run) -> Iterator[Breach]:

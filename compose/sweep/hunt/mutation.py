@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
+from itertools import count
 from typing import Any, get_args
 
 import msgspec
@@ -28,6 +29,8 @@ ALIKE = (("a", "A"), ("r1", "R1"), ("r1", "r10"), ("a", "aa"), ("a-b", "a_b"), (
 """Names of two robots that something which compares them wrongly may confuse."""
 RANGE_SIGMAS = (0.001, 0.01, 0.05, 0.1)
 """The sigmas in m of ranges that are drawn."""
+GYRO_BIASES = (0.0, 0.0002)
+"""The sigmas in rad/s of gyro biases that are drawn: groups need calibrated gyros."""
 MOST_FAULTS, MOST_KILLS = 5, 16
 """The numbers of faults and of kills beyond which none is added."""
 CELLS_OF_SWEEP = 6
@@ -53,7 +56,7 @@ class Clues(msgspec.Struct, frozen=True):
 def seeds(source: str) -> list[Table]:
     """Return the inputs with which the hunt begins: `source`, then cells of the shipped sweeps of it.
 
-    Those with exact sensors come first: their missions take a twentieth of the time.
+    Those with exact sensors and those with noisy ones take turns.
     """
     found = [scenario_table(source)]
     for name in spec.shipped():
@@ -61,7 +64,8 @@ def seeds(source: str) -> list[Table]:
         if sweep.base.get("name") == source:
             every = list(cells(sweep))
             found += [copy.deepcopy(dict(one.table)) for one in every[:: -(-len(every) // CELLS_OF_SWEEP)]]
-    return [found[0], *sorted(found[1:], key=is_noisy)]
+    turn = {False: count(), True: count()}
+    return [found[0], *sorted(found[1:], key=lambda one: next(turn[is_noisy(one)]))]
 
 
 def is_noisy(table: Mapping[str, Any]) -> bool:
@@ -164,6 +168,24 @@ def _attack(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     return table
 
 
+def _link(table: Table, known: Clues, draw: random.Random) -> Table | None:
+    """Attack the ranges of one link, for which sensors must have noise."""
+    if not is_noisy(table):
+        return None
+    one, other = draw.sample(known.robots, 2) if len(known.robots) > 1 else (known.robots * 2)[:2]
+    mutual = f"mutual/{one}" if len(known.robots) == 2 else f"mutual/{one}-{other}"
+    options: Table = {"link": draw.choice((mutual, mutual, f"anchor/{one}")), "begins": known.tick(draw)}
+    options |= draw.choice(({"by": draw.choice(LENGTHENED)}, {"relay": 3.0}, {"jam": True}))
+    if draw.random() < 0.5:
+        options["ends"] = options["begins"] + draw.choice((1, 10, 60))
+    table["world"] = {**table.get("world", {}), "range": {"model": "attacked", "options": options}}
+    return table
+
+
+LENGTHENED = (-1.0, -0.3, 0.3, 1.0)
+"""The lengths in m by which an attack makes ranges longer."""
+
+
 def _death(table: Table, known: Clues, draw: random.Random) -> Table | None:
     """Let a robot of a group die."""
     if "group" in table:
@@ -178,7 +200,7 @@ def _death(table: Table, known: Clues, draw: random.Random) -> Table | None:
 def _noise(table: Table, _known: Clues, draw: random.Random) -> Table:
     """Give all sensors other noise, which the robots are told."""
     sigma = draw.choice(RANGE_SIGMAS)
-    noise: Table = {"anchor_sigma": sigma, "mutual_sigma": sigma}
+    noise: Table = {"anchor_sigma": sigma, "mutual_sigma": sigma, "gyro_bias": draw.choice(GYRO_BIASES)}
     if draw.random() < 0.5:
         noise |= {"outliers": draw.choice((0.05, 0.2)), "drop_outs": draw.choice((0.0, 0.2))}
     if draw.random() < 0.5:
@@ -268,8 +290,9 @@ MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float]
     _kill: 3.0,
     _clock: 0.5,
     _attack: 1.0,
+    _link: 0.5,
     _death: 0.7,
-    _noise: 0.2,
+    _noise: 0.4,
     _planner: 0.3,
     _names: 0.7,
     _geometry: 1.0,
@@ -280,60 +303,48 @@ MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float]
 """The changes of an input, and how often each is drawn."""
 
 
-def simpler(table: Mapping[str, Any]) -> Iterator[Table]:
-    """Yield `table` without one of its parts that are not needed, and with smaller ones in their place."""
-    for name in ("fault", "kill", "clock"):
-        size = len(table.get(name, []))
-        while size:  # first all, then fewer of them
-            for i in range(0, len(table[name]), size):
-                yield _with(table, name, [*table[name][:i], *table[name][i + size :]])
+def simpler(table: Any) -> Iterator[Any]:
+    """Yield `table` without one of its parts, at any depth; many of these are no mission.
+
+    Faults and kills come first. Lists are left out as a whole, then by halves, and then by parts of those.
+    """
+    parts: list[tuple[Any, Any]] = []
+    if isinstance(table, list):
+        parts, size = list(enumerate(table)), len(table)
+        while size:
+            yield from [[*table[:i], *table[i + size :]] for i in range(0, len(table), size)]
             size //= 2
-    if table.get("group", {}).get("robots", 3) > 3:
-        yield _with(table, "group", "robots", table["group"]["robots"] - 1)
-    for way, fields in _dispensable(table):
-        place: Any = table
-        for step in way:
-            place = place[step]
-        for field in fields:
-            if field in place:
-                less = {key: value for key, value in place.items() if key != field}
-                yield _with(table, *way, less) if way else less
+    elif isinstance(table, dict):
+        parts = sorted(table.items(), key=lambda part: part[0] not in LISTS)
+        if table.get("robots", 3) > 3:
+            yield {**table, "robots": table["robots"] - 1}
+    for key, part in parts:
+        if key not in LISTS and isinstance(table, dict):
+            yield {name: one for name, one in table.items() if name != key}
+        for less in simpler(part):
+            found = copy.copy(table)
+            found[key] = less
+            yield found
 
 
-def _dispensable(table: Mapping[str, Any]) -> Iterator[tuple[tuple[Any, ...], Iterable[str]]]:
-    """Yield the paths of the parts of `table`, each with its fields that may be left out."""
-    for name in ("fault", "kill"):
-        for i, one in enumerate(table.get(name, [])):
-            yield (name, i), sorted(one.keys() - {"link", "who", "tick"})
-    for i in range(len(table.get("robot", []))):
-        yield ("robot", i), ("attack", "dies")
-    if "group" in table:
-        yield ("group",), ("attack", "dies", "without_anchor")
-    yield ("mission",), ("noise", "tolerates", "safety_distance")
-    yield (), ("planner", "world", "max_ticks")
-
-
-def _with(table: Mapping[str, Any], *way: Any) -> Table:
-    """Return a copy of `table` with the last of `way` at the path of the others."""
-    found = copy.deepcopy(dict(table))
-    place: Any = found
-    for step in way[:-2]:
-        place = place[step]
-    place[way[-2]] = way[-1]
-    return found
+LISTS = ("clock", "fault", "kill")
+"""The lists of a scenario file whose rows are in no order."""
 
 
 def fault_lines(table: Mapping[str, Any], source: Mapping[str, Any]) -> int:
     """Return the number of faults, kills, attacks, deaths and other fields by which `table` differs."""
-    lists: Sequence[str] = ("fault", "kill", "clock")
-    count = sum([sum([one not in source.get(name, []) for one in table.get(name, [])]) for name in lists])
-    before = {one["id"]: one for one in source.get("robot", [])}
-    for robot in table.get("robot", []):
-        count += sum([robot[field] != before.get(robot["id"], {}).get(field) for field in robot])
-    for name in (table.keys() | source.keys()) - {*lists, "robot", "seed", "name"}:
-        one, other = table.get(name), source.get(name)
-        if isinstance(one, dict) and isinstance(other, dict):
-            count += sum([one.get(field) != other.get(field) for field in one.keys() | other.keys()])
-        else:
-            count += one != other
-    return count
+    one, other = dict(_fields(table)), dict(_fields(source))
+    return sum([one.get(key) != other.get(key) for key in one.keys() | other.keys()])
+
+
+def _fields(table: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Yield the names of all fields of `table` with their values; a row of LISTS is one."""
+    for name, part in table.items():
+        if name in LISTS:
+            yield from [((name, repr(row)), True) for row in part]
+        elif isinstance(part, list):
+            yield from [((name, row["id"], field), value) for row in part for field, value in row.items()]
+        elif isinstance(part, dict):
+            yield from [((name, field), value) for field, value in part.items()]
+        elif name not in ("name", "seed"):
+            yield (name,), part
