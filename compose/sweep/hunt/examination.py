@@ -31,6 +31,8 @@ class Examined(msgspec.Struct, frozen=True):
     breaches: tuple[Breach, ...] = ()
     reached: frozenset[str] = frozenset()
     known: Clues = Clues(())
+    bound_share: float = 0.0
+    """The largest time of something with a computed bound, relative to that."""
     refused: str | None = None
     """The reason why the input was not run; None if it was."""
 
@@ -63,8 +65,10 @@ def examined(table: dict[str, Any]) -> Examined:
     every = [*again, *breaches(run, replayed=not again)]
     ids = tuple([one.id for one in scenario.robots])
     found |= seen | {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
-    found |= {f"bound, used: {10 * one.ticks // one.bound} of 10" for one in bounded(run) if one.ticks}
-    return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments))
+    shares = [one.ticks / one.bound for one in bounded(run) if one.ticks is not None]
+    return Examined(
+        tuple(every), frozenset(found), Clues(ids, run.length - 1, moments), max(shares, default=0.0)
+    )
 
 
 def _task(run: Run, kill: Kill) -> str:

@@ -31,6 +31,8 @@ SEEDS_OF_BATCH = 1
 """The number of the first inputs in a batch, until all have run: many have noisy sensors."""
 NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
+LATEST_SHARE = 0.1
+"""The share of inputs that are changes of the one that came nearest to a computed bound."""
 NOISY_SLOWER = 20.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks."""
 
@@ -71,6 +73,10 @@ class Hunt:
         self._seed, self._workers, self._guided = seed, workers, guided
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
+        self.latest: CorpusEntry | None = None
+        """The input whose run used most of a computed bound."""
+        self.bound_share = 0.0
+        """The share that it used."""
         self.seen: set[str] = set()
         """The states that the runs have reached."""
         self.runs = self.processes = self.refused = 0
@@ -106,8 +112,10 @@ class Hunt:
             one = draw.choice(self.seeds)
             known = Clues(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
             return mutated(one, known, draw.choice(self.seeds), draw)
-        latest = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
-        [entry] = draw.choices(latest, [one.share for one in latest])
+        some = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
+        [entry] = draw.choices(some, [one.share for one in some])
+        if self.latest is not None and draw.random() < LATEST_SHARE:
+            entry = self.latest
         return mutated(entry.table, entry.known, draw.choice(self.corpus).table, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
@@ -115,6 +123,8 @@ class Hunt:
         self.seen |= new
         if new:
             self.corpus.append(CorpusEntry(table, result.known))
+        if result.bound_share > self.bound_share:
+            self.latest, self.bound_share = CorpusEntry(table, result.known), result.bound_share
 
     def _as_processes(self, inputs: Sequence[Table]) -> FoundBreach | None:
         """Run the first of `inputs` that has kills as processes, if it is time for that."""

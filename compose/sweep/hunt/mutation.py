@@ -9,14 +9,16 @@ from __future__ import annotations
 import copy
 import random
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from itertools import count
-from typing import Any, get_args
+from typing import Any, cast, get_args
 
 import msgspec
 
+from compose.errors import UserError
 from compose.launch.planner_loader import PLANNER_NAMES
 from compose.scenario.kills import DRAWN_VALUE, KILL_POINTS, WORLD
-from compose.scenario.scenario_file import scenario_table
+from compose.scenario.scenario_file import scenario_table, validate
 from compose.sweep import spec
 from compose.sweep.cells import cells
 from compose.sweep.draws import Draws, Heading, Place, StartsTable
@@ -70,7 +72,7 @@ def seeds(source: str) -> list[Table]:
 
 def is_noisy(table: Mapping[str, Any]) -> bool:
     """Return whether the robots of the input are told that their sensors have noise."""
-    return bool(table["mission"].get("noise"))
+    return any(table["mission"].get("noise", {}).values())
 
 
 def mutated(table: Mapping[str, Any], known: Clues, other: Mapping[str, Any], draw: random.Random) -> Table:
@@ -234,18 +236,19 @@ def _geometry(table: Table, _known: Clues, draw: random.Random) -> Table:
     """Change one length, speed or time of the mission, or where the anchors are."""
     mission, factor = table["mission"], draw.choice((0.3, 0.7, 0.9, 1.1, 1.5, 3.0))
     anchored = [one for one in table.get("robot", []) if "anchor" in one]
-    match draw.choice(("anchor", "area", "period", "max_speed", "max_turn_rate", "sensing_range", "safety")):
-        case "anchor" if anchored:
+    lengths = ("spacing", "spacing", "spacing") if "group" in table else ("anchor",) * bool(anchored)
+    match draw.choice((*lengths, "period", "max_speed", "max_turn_rate", "sensing_range", "safety")):
+        case "anchor":
             one = draw.choice(anchored)
             x, y = one["anchor"]
             one["anchor"] = [x * factor, y * factor + draw.choice((0.0, 0.0, 2.0))]
             one.pop("start", None)
         case "safety":
             mission["safety_distance"] = draw.choice((0.0, 0.3, 0.8))
-        case "period" | "max_speed" | "max_turn_rate" | "sensing_range" as name:
-            mission[name] = mission[name] * factor
-        case _ if "group" in table:
+        case "spacing":
             table["group"]["spacing"] *= factor
+        case name:
+            mission[name] = mission[name] * factor
     return table
 
 
@@ -265,9 +268,17 @@ def _size(table: Table, _known: Clues, draw: random.Random) -> Table | None:
 
 
 def _less(table: Table, _known: Clues, draw: random.Random) -> Table | None:
-    """Leave something out."""
+    """Leave something out that a mission does not need."""
     shorter = list(simpler(table))
-    return draw.choice(shorter) if shorter else None
+    for one in draw.sample(shorter, min(len(shorter), SHORTENED)):
+        with suppress(UserError):
+            validate(one, "the input")
+            return cast(Table, one)
+    return None
+
+
+SHORTENED = 5
+"""The number of shorter inputs of which the first that is a mission is taken."""
 
 
 def _retimed(table: Table, known: Clues, draw: random.Random) -> Table | None:
