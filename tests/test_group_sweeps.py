@@ -76,6 +76,18 @@ def test_honest_robots_and_their_meetings_with_an_attacker_are_counted() -> None
     assert unaudited.attacker_met is None
 
 
+def test_the_robots_of_a_link_under_attack_count_as_peers_of_each_other() -> None:
+    table = scenario_table("random-group")
+    table["group"]["robots"] = 3
+    noise = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0002}
+    table["mission"] |= {"accuracy": 0.3, "noise": noise}
+    table["world"] = {"range": {"model": "attacked", "options": {"link": "mutual/r1-r2", "by": -1.0}}}
+    found = run_trial(trial(validate(table, "attacked.toml").scenario, audit=True)).group
+    assert found is not None
+    assert (found.attacker_met, found.attacker_found) == (2, 2)
+    assert (found.honest_localised, found.honest_wrong) == (3, 0)
+
+
 def test_a_robot_that_makes_no_claim_is_counted() -> None:
     scenario = group_of(4, 2)
     columns = group_columns(run_mission(replace(scenario, max_ticks=scenario.max_ticks // 12)))

@@ -37,7 +37,8 @@ class GroupColumns(msgspec.Struct, frozen=True, array_like=True):
     honest_wrong: int
     """number of honest robots whose claims are wrong"""
     attacker_met: int | None
-    """number of meetings of honest robots with one that has an attack; None if the trial was not audited"""
+    """number of meetings of honest robots with one that has an attack, or whose ranges have; None if the
+    trial was not audited"""
     attacker_found: int | None
     """number of these in which the robot reported that the other's data are inconsistent"""
 
@@ -82,13 +83,14 @@ def _met_and_found(run: Run, honest: list[str]) -> tuple[int, int]:
     verdict that its data are inconsistent.
     """
     attackers = {robot.id for robot in run.scenario.robots if robot.attack is not None}
+    link = run.scenario.attacked
     met: set[tuple[str, str]] = set()
     found: set[tuple[str, str]] = set()
     for robot in honest:
         for step in run.agents[robot].steps if robot in run.agents else ():
             for contact, framed in zip(step.observation.contacts, step.reports, strict=False):
                 report = framed.report
-                if contact.peer not in attackers:
+                if contact.peer not in attackers and not {contact.peer} <= link <= {robot, contact.peer}:
                     continue
                 if report.has_log:
                     met.add((robot, contact.peer))
