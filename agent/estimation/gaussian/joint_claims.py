@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.elementary import eigh, hypot
+from agent.estimation.elementary import eigh, hypot, product
 from agent.estimation.facts import AnchorPlace
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.consistency import FINISHED
@@ -75,7 +75,7 @@ def displacements(fit: Fit, used: JointMeasurements) -> Iterator[Displacement]:
             if free.last_step > FINISHED or not variances[0] > 0.0:
                 yield Displacement(name, (x, y), 0.0, along, math.inf)
                 continue
-            square = float(np.sum(np.square(axes.T @ away) / variances))
+            square = float(np.sum(np.square(product(away[None], axes)[0]) / variances))
             sigmas = math.sqrt(max(min(square, _worse_at(place, k, free, measured)), 0.0))
             yield Displacement(name, (x, y), sigmas, along, math.sqrt(float(variances[1])))
 

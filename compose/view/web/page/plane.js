@@ -152,10 +152,10 @@ export class Plane {
     const { robots, mission } = store.stage, reach = mission.sensing_range;
     const { anchor, orbit } = robots.find((robot) => robot.id === focus) ?? {};
     if (!truth && anchor) {
-      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], LIST_PX - CLEAR_PX);
+      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], this.#height_of("#caption"));
     }
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
-    return this.#frame(scenario_discs(chosen, store), LIST_PX - CLEAR_PX);
+    return this.#frame(scenario_discs(chosen, store), this.#height_of("#caption"));
   }
 
   /** Zooms to the robots and to all poses that they consider possible, or to those of the selected robot's pair. */
@@ -167,7 +167,7 @@ export class Plane {
       const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
       discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : scenario_discs([robot], store)));
     }
-    this.#frame(discs, this.#list_height());
+    this.#frame(discs, this.#height_of("#over"));
     this.#free();
     this.#redraw();
   }
@@ -176,7 +176,7 @@ export class Plane {
   follow(view, store, pair, now) {
     this.fitted = false;
     this.#measure();
-    const { scale, centre } = this.#framed(story_discs({ ...view, truth: view.truth, store }, pair), this.#list_height());
+    const { scale, centre } = this.#framed(story_discs({ ...view, truth: view.truth, store }, pair), this.#height_of("#over"));
     const s = now === null ? Infinity : Math.min(now - (this.easing || now - 16), 250) / 1000;
     const part = 1 - Math.exp(-s / EASE_S);
     this.scale *= (scale / this.scale) ** part;
@@ -186,10 +186,10 @@ export class Plane {
     if (!this.easing) Object.assign(this, { scale, centre });
   }
 
-  /** Returns the height in pixels of the list of predicted distances, of which the camera keeps clear. */
-  #list_height() {
-    const over = this.canvas.parentElement.querySelector("#over");
-    return Math.max(over.offsetTop + over.offsetHeight, LIST_PX) / unit() - CLEAR_PX;
+  /** Returns the height in pixels down to the end of a text over the plane, of which the camera keeps clear. */
+  #height_of(name) {
+    const { top } = this.canvas.getBoundingClientRect(), { bottom } = document.querySelector(name).getBoundingClientRect();
+    return Math.max(bottom - top, LIST_PX) / unit() - CLEAR_PX;
   }
 
   #frame(discs, top) { Object.assign(this, this.#framed(discs, top)); }
