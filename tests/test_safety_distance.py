@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.planning import separation
+from compose.audit.claim_rules import distance
 from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest
 from compose.scenario.scenario_file import load, validate
@@ -86,6 +87,15 @@ def test_none_comes_nearer_under_noise(seed: int) -> None:
     found = nearest(recording)
     assert found is not None
     assert found >= SAFE
+
+
+def test_what_ranges_cannot_tell_is_no_violation() -> None:
+    mission = load("noisy", seed=7).mission
+    recording = run_mission(replace(load("noisy", seed=7), mission=replace(mission, safety_distance=0.3)))
+    found = nearest(recording)
+    assert found is not None
+    assert 0.3 - 3.0 * mission.noise.mutual_sigma < found < 0.3
+    assert not any(distance(recording))
 
 
 @settings(max_examples=20)

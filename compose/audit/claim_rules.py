@@ -10,6 +10,7 @@ from typing import Any
 from agent.estimation.judged import sufficient_mutual_ranges
 from agent.estimation.mutual_ranges import ELSEWHERE
 from agent.planning.planner import Planner
+from agent.planning.separation import LARGEST_ERROR_SIGMAS
 from agent.process.agent_journal import AgentHistory
 from compose.audit.findings import Checks, Violation, between
 from compose.launch.planner_loader import planner_of
@@ -45,14 +46,17 @@ def claim(run: Run) -> Checks:
 
 
 def distance(run: Run) -> Checks:
-    """Check that no two robots came nearer than the safety distance, nor than they began."""
+    """Check that no two robots came nearer than the safety distance, nor than they began.
+
+    Under noise, three sigmas of a range less: that is how well robots know it.
+    """
     least = run.scenario.mission.safety_distance
     if not least or (found := nearest(run)) is None:
         return
     begun = [
         math.dist((one.x, one.y), (two.x, two.y)) for one, two in combinations(run.ticks[0].truth.poses, 2)
     ]
-    least = min([least, *begun])
+    least = min([least, *begun]) - LARGEST_ERROR_SIGMAS * run.scenario.mission.noise.mutual_sigma
     what = f"two robots came {found:.6g} m near, expected at least {least:.6g} m"
     near = found < least * (1.0 - TOUCHING)
     yield Violation("distance", run.length - 1, None, what) if near else None
