@@ -78,6 +78,18 @@ def summary() -> str:
     return "\n".join(map(_line, lines))
 
 
+def link_attacks() -> str:
+    """Return the table of attacks on one link of a pair in Markdown: how missions end."""
+    file = read("link-attacks")
+    assert file is not None
+    outcomes = ("localised", "inconsistent", "undecided", "wrong")
+    cells = [
+        [one.label.removeprefix("attack = "), *[_counted(name)([one]) for name in outcomes]]
+        for one in file.cell
+    ]
+    return "\n".join(map(_line, [["attack", *outcomes], ["---"] * 5, *cells]))
+
+
 def _share(count: int, trials: int) -> str:
     """Return a share in percent with its 95 % interval."""
     interval = wilson(count, trials)
