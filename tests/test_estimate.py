@@ -46,7 +46,7 @@ from compose.recording.ranging.range_recording import (
 )
 from compose.recording.ranging.range_steps import dead_reckoned, relative
 from compose.view.epochs import write_player
-from compose.view.estimated import read_player
+from compose.view.played_estimate import read_player
 from compose.view.recorded import scenes as recorded_scenes
 from docs import recorded_claims
 from protocol.motion import Pose, step, travelled

@@ -90,10 +90,12 @@ def test_an_input_is_examined_and_a_defect_is_named(monkeypatch: pytest.MonkeyPa
 def test_the_parts_of_an_input_are_left_out_one_after_the_other() -> None:
     table = scenario_table("paper-1")
     worse = {**table, "kill": [{"who": "a", "tick": 3, "after": 1.0}, {"who": "b", "tick": 4}]}
-    left = [one.get("kill") for one in simpler(worse)]
+    left = [one.get("kill") for one in simpler(worse, table)]
     assert left[:3] == [[], worse["kill"][1:], worse["kill"][:1]]
     assert {"who": "a", "tick": 3} in [kills[0] for kills in left[3:] if kills]
-    assert table.keys() - {"kill"} <= {name for one in simpler(worse) for name in worse.keys() - one.keys()}
+    assert {name for one in simpler(table, {}) for name in table.keys() - one.keys()} == table.keys()
+    moved = {**table, "robot": [{**table["robot"][0], "start": [0.0, 1.0, 2.0]}, table["robot"][1]]}
+    assert table in list(simpler(moved, table))
     assert (fault_lines(worse, table), fault_lines(table, table)) == (2, 0)
 
 

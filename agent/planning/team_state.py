@@ -1,4 +1,4 @@
-"""What a robot of a team knows: its measurements and those of others, the poses of all, and its claim."""
+"""The knowledge of a robot of a team: the measurements of all, their poses, and its claim."""
 
 from __future__ import annotations
 

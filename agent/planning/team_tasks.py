@@ -1,4 +1,4 @@
-"""What a robot of a team does next, by what it knows.
+"""The next task of a robot of a team, by what it knows.
 
 It drives a loop until it is located. If it has ranges to one anchor only, it drives past the nearest other
 one on a circle about the first. Then it drives to where its next ranges are expected to tell most, until it

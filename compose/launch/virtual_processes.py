@@ -384,4 +384,4 @@ def world_process(network: VirtualNetwork, process: VirtualProcess) -> None:
 
 
 Body = Callable[[VirtualNetwork, VirtualProcess], None]
-"""What a process runs."""
+"""The function that a process runs."""

@@ -15,7 +15,7 @@ from compose.recording.estimating.estimate_run import RecordingEstimate
 from compose.recording.estimating.recorded_measurements import EPOCH_S, Measurements
 from compose.recording.estimating.true_poses import true_pose
 from compose.recording.run_setup import ESTIMATED, AnchorSetup, RobotSetup, RunSetup
-from compose.view.estimated import PLAYER_JSON, Epoch, PlayedEstimate
+from compose.view.played_estimate import PLAYER_JSON, Epoch, PlayedEstimate
 from protocol import files
 from protocol.messages import (
     Cause,

@@ -26,7 +26,7 @@ class PairData(msgspec.Struct, frozen=True):
     events: Sequence[Event] = ()
     """The events of this tick."""
     gaps: Mapping[str, float] = {}
-    """How far from its true position, in m, each attacker reports to be."""
+    """The distance in m between the true position of each attacker and the one that it reports."""
 
     @property
     def ids(self) -> tuple[str, ...]:

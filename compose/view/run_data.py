@@ -78,7 +78,7 @@ class RunData:
         self.last = -1
         """The latest tick with any data; -1 if there is none."""
         self.costs: tuple[str, ...] = ()
-        """What each fault, attack and kill has cost, as sentences; empty until it is known."""
+        """The costs of the faults, attacks and kills, as sentences; empty until they are known."""
         self.has_truth = False
         """True once the ground truth of any tick is known."""
         self._seen: set[str | None] = set()

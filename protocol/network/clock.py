@@ -15,6 +15,8 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
+from protocol import documents
+
 Seconds = Annotated[float, Meta(ge=-1e9, le=1e9)]
 """A time of a clock, in s."""
 
@@ -23,9 +25,9 @@ class ClockError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The error of a clock, to test that it does no harm."""
 
     offset: Seconds = 0.0
-    """What the clock is ahead from the start on, in s."""
+    """The time by which the clock is ahead from the start on, in s."""
     drift: Annotated[float, Meta(ge=-1e5, le=1e5)] = 0.0
-    """What it gains, in ppm: 1 ppm is a second in 11.6 days."""
+    """The rate at which it gains time, in ppm: 1 ppm is a second in 11.6 days."""
     jumps: tuple[tuple[Annotated[float, Meta(ge=0.0, le=1e9)], Seconds], ...] = ()
     """Pairs of the time in s after the start at which it jumps, and by how many s: ahead, or back if
     negative."""
@@ -59,7 +61,7 @@ class Clock:
     def told(cls, text: str) -> Clock:
         """Return the clock of `ClockError.arguments`. Raises ValueError."""
         try:
-            return cls(*msgspec.json.decode(text, type=tuple[ClockError, float]))
+            return cls(*documents.json_value(text, tuple[ClockError, float]))
         except msgspec.DecodeError as error:
             raise ValueError(str(error)) from None
 

@@ -20,7 +20,7 @@ from agent.estimation.gaussian.search import FEWEST_DECISIVE, OPEN, beacons, pos
 
 
 class Displacement(NamedTuple):
-    """How far the ranges of an anchor favour another position than that which was told."""
+    """The distance by which the ranges of an anchor favour another position than that which was told."""
 
     anchor: str
     vector: tuple[float, float]

@@ -94,7 +94,7 @@ class Hunt:
                     self.runs += 1
                     self.refused += result.refused is not None
                     if result.breaches:
-                        return _shrunk(table, result.breaches[0], self.runs, self._workers, examine)
+                        return self._shrunk(table, result.breaches[0], examine)
                     self._keep(table, result)
                 if (found := self._as_processes(inputs)) is not None or is_over(self):
                     return found
@@ -126,6 +126,20 @@ class Hunt:
         if result.bound_share > self.bound_share:
             self.latest, self.bound_share = CorpusEntry(table, result.known), result.bound_share
 
+    def _shrunk(self, table: Table, breach: Breach, examine: Examine) -> FoundBreach:
+        """Return the input nearest to the source with the same breach, as far as MOST_TRIES runs show."""
+        left, tries = list(simpler(table, self.seeds[0])), 0
+        while left and tries < MOST_TRIES:
+            size = min(self._workers, MOST_TRIES - tries)
+            tried, left = left[:size], left[size:]
+            for smaller, result in zip(tried, examine(tried), strict=True):
+                tries += result.refused is None
+                same = next((one for one in result.breaches if one.kind == breach.kind), None)
+                if same is not None:
+                    table, breach, left = smaller, same, list(simpler(smaller, self.seeds[0]))
+                    break
+        return FoundBreach(table, breach, self.runs)
+
     def _as_processes(self, inputs: Sequence[Table]) -> FoundBreach | None:
         """Run the first of `inputs` that has kills as processes, if it is time for that."""
         due = self.runs // PROCESSES_EACH > (self.runs - len(inputs)) // PROCESSES_EACH
@@ -147,21 +161,6 @@ class Hunt:
 
 
 Examine = Callable[[Sequence[Table]], Iterator[Examined]]
-
-
-def _shrunk(table: Table, breach: Breach, runs: int, workers: int, examine: Examine) -> FoundBreach:
-    """Return the smallest input that breaks the same invariant, as far as MOST_TRIES runs show it."""
-    left, tries = list(simpler(table)), 0
-    while left and tries < MOST_TRIES:
-        size = min(workers, MOST_TRIES - tries)
-        tried, left = left[:size], left[size:]
-        for smaller, result in zip(tried, examine(tried), strict=True):
-            tries += result.refused is None
-            same = next((one for one in result.breaches if one.kind == breach.kind), None)
-            if same is not None:
-                table, breach, left = smaller, same, list(simpler(smaller))
-                break
-    return FoundBreach(table, breach, runs)
 
 
 @contextmanager

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import copy
 import random
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import count
-from typing import Any, cast, get_args
+from typing import Any, get_args
 
 import msgspec
 
@@ -269,11 +269,11 @@ def _size(table: Table, _known: Clues, draw: random.Random) -> Table | None:
 
 def _less(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     """Leave something out that a mission does not need."""
-    shorter = list(simpler(table))
+    shorter = list(simpler(table, {}))
     for one in draw.sample(shorter, min(len(shorter), SHORTENED)):
         with suppress(UserError):
             validate(one, "the input")
-            return cast(Table, one)
+            return one
     return None
 
 
@@ -314,28 +314,41 @@ MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float]
 """The changes of an input, and how often each is drawn."""
 
 
-def simpler(table: Any) -> Iterator[Any]:
-    """Yield `table` without one of its parts, at any depth; many of these are no mission.
+def simpler(table: Table, source: Table) -> Iterator[Table]:
+    """Yield `table` with one of its differences from `source` undone, at any depth, the largest first.
 
-    Faults and kills come first. Lists are left out as a whole, then by halves, and then by parts of those.
+    Faults and kills come first: they are left out as a whole, then by halves, and then by parts of those.
     """
-    parts: list[tuple[Any, Any]] = []
-    if isinstance(table, list):
-        parts, size = list(enumerate(table)), len(table)
-        while size:
-            yield from [[*table[:i], *table[i + size :]] for i in range(0, len(table), size)]
-            size //= 2
-    elif isinstance(table, dict):
-        parts = sorted(table.items(), key=lambda part: part[0] not in LISTS)
-        if table.get("robots", 3) > 3:
-            yield {**table, "robots": table["robots"] - 1}
-    for key, part in parts:
-        if key not in LISTS and isinstance(table, dict):
-            yield {name: one for name, one in table.items() if name != key}
-        for less in simpler(part):
-            found = copy.copy(table)
-            found[key] = less
-            yield found
+    for key in sorted(table.keys() | source.keys(), key=lambda name: (name not in LISTS, name)):
+        one, other = table.get(key), source.get(key)
+        if one == other:
+            continue
+        if key in LISTS:
+            yield from [{**table, key: rows} for rows in _fewer(list(one or ()))]
+            continue
+        without = {name: part for name, part in table.items() if name != key}
+        yield {**without, key: other} if key in source else without
+        if isinstance(one, dict):
+            yield from [{**table, key: part} for part in simpler(one, other or {})]
+        elif isinstance(one, list):
+            others = other if isinstance(other, list) and len(other) == len(one) else [{}] * len(one)
+            yield from [{**table, key: rows} for rows in _nearer(one, others)]
+
+
+def _fewer(rows: list[Any]) -> Iterator[list[Any]]:
+    """Yield `rows` without all, without each half and so on, and then without one field of one of them."""
+    size = len(rows)
+    while size:
+        yield from [[*rows[:i], *rows[i + size :]] for i in range(0, len(rows), size)]
+        size //= 2
+    yield from _nearer(rows, [{}] * len(rows))
+
+
+def _nearer(rows: Sequence[Any], others: Sequence[Any]) -> Iterator[list[Any]]:
+    """Yield `rows` with one difference of a row from that of `others` undone."""
+    for i, (row, other) in enumerate(zip(rows, others, strict=True)):
+        if isinstance(row, dict) and isinstance(other, dict):
+            yield from [[*rows[:i], less, *rows[i + 1 :]] for less in simpler(row, other)]
 
 
 LISTS = ("clock", "fault", "kill")

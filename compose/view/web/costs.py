@@ -1,4 +1,4 @@
-"""What the faults, attacks and kills of a mission cost: the same mission without them, run again.
+"""The costs of the faults, attacks and kills of a mission, found by running it without them.
 
 Runs are deterministic, and each draw has a random stream of its own, so nothing else differs.
 """

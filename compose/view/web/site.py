@@ -13,13 +13,13 @@ from compose.errors import UserError
 from compose.recording.comparison import comparison
 from compose.recording.recording_files import journals_in
 from compose.recording.run import read
-from compose.view.estimated import read_player
+from compose.view.played_estimate import read_player
 from compose.view.web import results_page
 from compose.view.web.costs import costs
 from compose.view.web.live import Listener
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.reruns import ChangedMissions, Trials
-from compose.view.web.sources import Estimated, Recorded, WatchedRun, end_of
+from compose.view.web.sources import Recorded, WatchedEstimate, WatchedRun, end_of
 from protocol import files
 from protocol.journal.journal_file import CorruptJournal
 
@@ -49,7 +49,7 @@ class Site:
         self.folder = folder
         self.estimate = estimate
         player = read_player(estimate) if estimate is not None else None
-        self.players = [Estimated(player)] if player is not None else []
+        self.players = [WatchedEstimate(player)] if player is not None else []
         self.work = RequestedWork()
         self.trials = Trials(folder, self.work) if folder is not None else None
         self.changed = ChangedMissions(self.work)

@@ -16,7 +16,7 @@ from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, journals_in, robot_of
 from compose.recording.run_setup import RunSetup, of_configs, of_scenario
 from compose.recording.summary_json import SUMMARY_JSON
-from compose.view.estimated import PlayedEstimate
+from compose.view.played_estimate import PlayedEstimate
 from compose.view.run_data import RunData
 from protocol import documents
 from protocol.journal.journal_file import CorruptJournal, OtherVersion, Tail
@@ -274,7 +274,7 @@ class Recorded(WatchedRun):
         self._expected = False
 
 
-class Estimated(WatchedRun):
+class WatchedEstimate(WatchedRun):
     """The estimate in a folder, as a run that has ended."""
 
     live = False

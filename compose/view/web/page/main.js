@@ -307,7 +307,7 @@ function draw() {
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
     controls();
     $("caption").classList.toggle("several", guide.several(view));
-    caption(guide.text(view));
+    text($("caption"), guide.text(view));
     predictions.draw(view, store, guide.pair(view.focus));
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), (view.playing || plane.easing) && !still.matches ? now : null);
     attribute(document.body, "data-tick", String(view.tick));
@@ -374,16 +374,6 @@ function controls() {
 function knows_bearing() {
   const players = store.scene(view.tick)?.players ?? [];
   return players.filter((player) => !view.focus || player.robot === view.focus).every((player) => player.held?.world.length);
-}
-
-/** Shows a caption. Its room never becomes smaller in a window, so that the plane keeps its size. */
-function caption(content) {
-  const box = $("caption"), room = `${window.innerWidth}x${window.innerHeight}`;
-  if (box.textContent === content && box.dataset.room === room) return;
-  if (box.dataset.room !== room) box.style.minHeight = "";
-  box.dataset.room = room;
-  text(box, content);
-  box.style.minHeight = `${box.offsetHeight}px`;
 }
 
 /** Sets an attribute only if it changes: else the browser computes styles again in each frame. */

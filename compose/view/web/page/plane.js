@@ -19,9 +19,8 @@ import { metres } from "./words.js";
 const EASE_S = 0.45;
 /** The distance in pixels from which on the camera is where it is needed. */
 const NEAR_PX = 0.5;
-/** The height in pixels of a list of predicted distances in one line, and the part of it that is in the margin of a picture. */
-const LIST_PX = 42;
-const CLEAR_PX = 12;
+/** The height in pixels down to the end of a caption, the largest share of the plane that it counts for, and the part of it that is in the margin. */
+const CAPTION_PX = 92, CAPTION_SHARE = 0.2, CLEAR_PX = 12;
 /** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
 const DRAG_PX = 4;
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
@@ -152,10 +151,10 @@ export class Plane {
     const { robots, mission } = store.stage, reach = mission.sensing_range;
     const { anchor, orbit } = robots.find((robot) => robot.id === focus) ?? {};
     if (!truth && anchor) {
-      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], this.#height_of("#caption"));
+      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], this.#texts());
     }
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
-    return this.#frame(scenario_discs(chosen, store), this.#height_of("#caption"));
+    return this.#frame(scenario_discs(chosen, store), this.#texts());
   }
 
   /** Zooms to the robots and to all poses that they consider possible, or to those of the selected robot's pair. */
@@ -167,7 +166,7 @@ export class Plane {
       const poses = [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])];
       discs.push(...(poses.length ? poses.map((pose) => [pose, 0.3 * reach]) : scenario_discs([robot], store)));
     }
-    this.#frame(discs, this.#height_of("#over"));
+    this.#frame(discs, this.#texts(document.querySelector("#predictions")));
     this.#free();
     this.#redraw();
   }
@@ -176,7 +175,7 @@ export class Plane {
   follow(view, store, pair, now) {
     this.fitted = false;
     this.#measure();
-    const { scale, centre } = this.#framed(story_discs({ ...view, truth: view.truth, store }, pair), this.#height_of("#over"));
+    const { scale, centre } = this.#framed(story_discs({ ...view, truth: view.truth, store }, pair), this.#texts(document.querySelector("#predictions")));
     const s = now === null ? Infinity : Math.min(now - (this.easing || now - 16), 250) / 1000;
     const part = 1 - Math.exp(-s / EASE_S);
     this.scale *= (scale / this.scale) ** part;
@@ -186,10 +185,10 @@ export class Plane {
     if (!this.easing) Object.assign(this, { scale, centre });
   }
 
-  /** Returns the height in pixels down to the end of a text over the plane, of which the camera keeps clear. */
-  #height_of(name) {
-    const { top } = this.canvas.getBoundingClientRect(), { bottom } = document.querySelector(name).getBoundingClientRect();
-    return Math.max(bottom - top, LIST_PX) / unit() - CLEAR_PX;
+  /** Returns the height in pixels of the texts over the plane, of which the camera keeps clear: a caption, and a list if there is one. */
+  #texts(list = null) {
+    const { top, height } = this.canvas.getBoundingClientRect(), { bottom } = list?.getBoundingClientRect() ?? { bottom: 0 };
+    return Math.max(bottom - top, Math.min(CAPTION_PX, CAPTION_SHARE * height)) / unit() - CLEAR_PX;
   }
 
   #frame(discs, top) { Object.assign(this, this.#framed(discs, top)); }
