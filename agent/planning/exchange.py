@@ -160,9 +160,7 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
         return controls
     if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
         return REST
-    return separation.slowed(
-        controls, separation.SHARE_OF_EACH * separation.leeway(state.mutual[-1].range, mission), mission
-    )
+    return separation.slowed(controls, separation.leeway_of_each(state.mutual[-1].range, mission), mission)
 
 
 KEPT_PLACES = 3

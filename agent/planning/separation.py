@@ -29,6 +29,11 @@ def leeway(rho: float, mission: Mission) -> float:
     return max(0.0, rho - LARGEST_ERROR_SIGMAS * mission.noise.mutual_sigma - mission.safety_distance)
 
 
+def leeway_of_each(rho: float, mission: Mission) -> float:
+    """Return how far in m each of two robots `rho` m apart may go in any direction, as both may drive."""
+    return SHARE_OF_EACH * leeway(rho, mission)
+
+
 def slowed(controls: Controls, metres: float, mission: Mission) -> Controls:
     """Return `controls` with the same arc, shortened to the length `metres` in m."""
     length = abs(controls.v) * mission.period

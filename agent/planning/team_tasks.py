@@ -61,12 +61,11 @@ def next_task(state: TeamState) -> TeamState:
     """Return `state` with the task and the controls of the next tick: the first that has a reason."""
     for task in (_at_rest, _searching, _looping, _joining, _returning):
         if (after := task(state)) is not None:
-            return _passing_robots(after)
-    state = _arrived(state)
-    for task in (_as_beacon, _surveying, _passing):
-        if (after := task(state)) is not None:
-            return _passing_robots(after)
-    return _passing_robots(_circling(state))
+            break
+    else:
+        arrived = _arrived(state)
+        after = _as_beacon(arrived) or _surveying(arrived) or _passing(arrived) or _circling(arrived)
+    return _passing_robots(after)
 
 
 def _passing_robots(state: TeamState) -> TeamState:
@@ -77,7 +76,7 @@ def _passing_robots(state: TeamState) -> TeamState:
     mission, here, passing = state.config.mission, state.odometry, state.passing
     if not mission.safety_distance:
         return state
-    free = [separation.SHARE_OF_EACH * separation.leeway(rho, mission) for rho in state.apart.values()]
+    free = [separation.leeway_of_each(rho, mission) for rho in state.apart.values()]
     passing = replace(passing, leeway=min(free, default=math.inf))
     if passing.places and (_aside(passing, state) is None or state.controls == REST):
         passing = replace(passing, places=passing.places[1:] if state.controls != REST else ())
@@ -106,6 +105,7 @@ def safe_controls(state: TeamState) -> Controls:
 
 
 def _aside(passing: Bypass, state: TeamState) -> Controls | None:
+    """Return the controls to the next place of the way aside; None if it is there, or on no such way."""
     if not passing.places:
         return None
     return homing(Pose(*passing.places[0], 0.0), state.odometry, state.config.mission, ARRIVED)

@@ -140,7 +140,7 @@ def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> f
     `peer` is None if it does not go on with the meeting: then the robot passes it like any other.
     """
     free = [
-        0.0 if one.range is None else separation.SHARE_OF_EACH * separation.leeway(one.range, mission)
+        0.0 if one.range is None else separation.leeway_of_each(one.range, mission)
         for one in contacts
         if one.peer != peer
     ]
