@@ -93,7 +93,7 @@ def _driver_process(
 
 def _wrong(ground: _Ground, folder: Path) -> tuple[Cause, ...]:
     """Return the wrong claims in the journals of the agents."""
-    run, found = read(folder), []
+    run, found = read(folder), list[Cause | None]()
     for robot, body in ground.bodies.items():
         before: Any = None
         for tick, pose in sorted(body.sensed.items()):
@@ -121,9 +121,16 @@ class _Ground:
         """Return the poses now, for sensors that measure in `tick`."""
         return Truth(tick, tuple([one.pose for one in self.bodies.values()]), self.origins)
 
-    def contacts(self, tick: int) -> dict[tuple[int, int], Mutual]:
-        """Return the ranges that robots which are all in `tick` measure now."""
-        return in_contact(self.truth(tick), self.scenario, self.pairs)
+    def contacts(self, tick: int, place: int) -> dict[int, Mutual]:
+        """Return the ranges to the robot at `place`, by the other's place, as if all were in `tick`."""
+        found = in_contact(self.truth(tick), self.scenario, self.pairs)
+        return {i + j - place: mutual for (i, j), mutual in found.items() if place in (i, j)}
+
+    def wake_asking(self) -> None:
+        """Let those go on that wait for others to measure ranges."""
+        for body in self.bodies.values():
+            if body.asks:
+                self.network.at(self.network.now, body.process.wake)
 
 
 class _Body:
@@ -141,7 +148,7 @@ class _Body:
         self._ranges: dict[str, float | None] = {}
         """The ranges of the latest tick."""
         self._is_parked = False
-        self._asks = False
+        self.asks = False
         """True while it waits for others to measure ranges."""
         self.tick = -1
         """The tick of the latest reading."""
@@ -160,6 +167,7 @@ class _Body:
         return max(0.0, driven - self._done)
 
     def _settle(self) -> None:
+        """Move what has been driven of the manoeuvre into `_start` and `_driven`."""
         share, self._start = self._share(), self.pose
         self._done += share
         driven = self._driven
@@ -189,20 +197,18 @@ class _Body:
         """Measure the ranges to those that wait for it; wait for the others, and say which are near."""
         ground, tick, others = self._ground, self.tick, [*self._ground.bodies.values()]
         others.remove(self)
-        now = ground.contacts(tick)
+        mutual = ground.contacts(tick, self._place)
         for other in others:
-            mutual = now.get((min(self._place, other._place), max(self._place, other._place)))
-            if mutual is not None and (other._is_parked or (other._asks and other.tick == tick)):
-                self._ranges[other._id] = other._ranges[self._id] = mutual.range
-            if other._asks:
-                ground.network.at(ground.network.now, other.process.wake)
-        self._asks, until = True, ground.network.now + ground.patience_s
+            if other._place in mutual and (other._is_parked or (other.asks and other.tick == tick)):
+                self._ranges[other._id] = other._ranges[self._id] = mutual[other._place].range
+        ground.wake_asking()
+        self.asks, until = True, ground.network.now + ground.patience_s
         while any(one.tick < tick and not one._is_parked for one in others) and ground.network.now < until:
             self.process.wait(until)
-        self._asks = False
-        now = ground.contacts(tick)
+        self.asks = False
+        mutual = ground.contacts(tick, self._place)
         for other in others:
-            if (min(self._place, other._place), max(self._place, other._place)) in now:
+            if other._place in mutual:
                 self._ranges.setdefault(other._id, None)
 
     def drive(self, v: float, omega: float) -> None:
@@ -217,9 +223,7 @@ class _Body:
         """Stop, and stay available for the ranges of others."""
         self._settle()
         self._controls, self._is_parked = REST, True
-        for other in self._ground.bodies.values():
-            if other._asks:
-                self._ground.network.at(self._ground.network.now, other.process.wake)
+        self._ground.wake_asking()
 
     def close(self) -> None:
         """Do nothing."""
