@@ -124,7 +124,7 @@ def test_a_hunt_compares_distances_with_the_safety_distance(monkeypatch: pytest.
     table["mission"]["safety_distance"] = 1.0
     assert [one.kind for one in examined({**table, "seed": NEAR}).breaches] == []
     monkeypatch.setattr(phase3_last_manoeuvre, "nearest", lambda _, v, *__: np.full(v.shape, math.inf))
-    assert "safety distance" in [one.kind for one in examined({**table, "seed": NEAR}).breaches]
+    assert "audit: distance" in [one.kind for one in examined({**table, "seed": NEAR}).breaches]
 
 
 @pytest.mark.long

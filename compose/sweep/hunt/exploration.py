@@ -31,7 +31,7 @@ SEEDS_OF_BATCH = 1
 """The number of the first inputs in a batch, until all have run: many have noisy sensors."""
 NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
-LATEST_SHARE = 0.1
+SLOWEST_SHARE = 0.1
 """The share of inputs that are changes of the one that came nearest to a computed bound."""
 NOISY_SLOWER = 20.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks."""
@@ -73,7 +73,7 @@ class Hunt:
         self._seed, self._workers, self._guided = seed, workers, guided
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
-        self.latest: CorpusEntry | None = None
+        self.slowest: CorpusEntry | None = None
         """The input whose run used most of a computed bound."""
         self.bound_share = 0.0
         """The share that it used."""
@@ -114,8 +114,8 @@ class Hunt:
             return mutated(one, known, draw.choice(self.seeds), draw)
         some = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
         [entry] = draw.choices(some, [one.share for one in some])
-        if self.latest is not None and draw.random() < LATEST_SHARE:
-            entry = self.latest
+        if self.slowest is not None and draw.random() < SLOWEST_SHARE:
+            entry = self.slowest
         return mutated(entry.table, entry.known, draw.choice(self.corpus).table, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
@@ -124,7 +124,7 @@ class Hunt:
         if new:
             self.corpus.append(CorpusEntry(table, result.known))
         if result.bound_share > self.bound_share:
-            self.latest, self.bound_share = CorpusEntry(table, result.known), result.bound_share
+            self.slowest, self.bound_share = CorpusEntry(table, result.known), result.bound_share
 
     def _shrunk(self, table: Table, breach: Breach, examine: Examine) -> FoundBreach:
         """Return the input nearest to the source with the same breach, as far as MOST_TRIES runs show."""

@@ -12,7 +12,6 @@ import numpy as np
 
 from agent.estimation.claim import is_definite
 from compose.audit import agent_rules, rules
-from compose.recording.closest_approach import nearest
 from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run
 from compose.sweep.trial import Trial, row
@@ -44,7 +43,7 @@ def breaches(run: Run, *, replayed: bool) -> Iterator[Breach]:
     for one in rules.audit_run(run, left).violations:
         if one.rule != "claim" or _must_be_right(run.scenario):
             yield Breach(f"audit: {one.rule}", one.line)
-    for check in (blamed, unfinished, late, near, truth_lost, forgotten, kept, indefinite):
+    for check in (blamed, unfinished, late, truth_lost, forgotten, kept, indefinite):
         yield from check(run)
 
 
@@ -62,24 +61,11 @@ def _guaranteed(scenario: Scenario) -> bool:
     fair = fair and not any(one.partition and not (one.ticks or one.contact_ticks) for one in scenario.faults)
     exact = scenario.mission.noise.exact and scenario.world_noise is None and scenario.range_model is None
     honest = all(one.attack is None for one in scenario.robots) and not scenario.deaths
-    if scenario.mission.safety_distance and min(_apart(scenario)) <= scenario.mission.sensing_range:
+    places = [(one.start.x, one.start.y) for one in scenario.robots]
+    apart = min([math.dist(*ends) for ends in combinations(places, 2)], default=math.inf)
+    if scenario.mission.safety_distance and apart <= scenario.mission.sensing_range:
         return False  # robots that begin in range of each other may block each other
     return fair and exact and honest and scenario.planner_name == "assured" and scenario.radio_model is None
-
-
-def _apart(scenario: Scenario) -> list[float]:
-    """Return the distances in m at the start of the robots that may range each other."""
-    starts = [one.start for one in scenario.robots]
-    return [math.dist((a.x, a.y), (b.x, b.y)) for a, b in combinations(starts, 2)] or [math.inf]
-
-
-def near(run: Run) -> Iterator[Breach]:
-    """Robots with exact sensors keep the safety distance, unless they begin nearer."""
-    scenario, least = run.scenario, run.scenario.mission.safety_distance
-    if least and scenario.mission.noise.exact and scenario.world_noise is None:
-        found = nearest(run)
-        if found is not None and found < min(least, *_apart(scenario)) - TRUTH_M:
-            yield Breach("safety distance", f"two robots come as near as {found:.4g} m, not {least:g}")
 
 
 def blamed(run: Run) -> Iterator[Breach]:
@@ -113,7 +99,7 @@ class Bounded(NamedTuple):
 
 
 def bounded(run: Run) -> Iterator[Bounded]:
-    """Yield what has a bound in `run`: the meeting of a pair, all meetings of a group, and of a team."""
+    """Yield what has a bound in `run`: the meeting of a pair, or each robot that a group localises."""
     scenario = run.scenario
     if not _guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
         return
