@@ -77,8 +77,8 @@ def captions(
     """Yield the captions of the tick of `now`, and at last that of the end of the mission.
 
     `events` are those of this tick, `setup` has the present peers of robots, and `gaps` how far from its true
-    position in m each attacker reports to be. Claims with which all are
-    localised have no caption: that of the end is about them.
+    position in m each attacker reports to be. Claims with which all are localised have no caption: that of
+    the end is about them.
     """
     ended = end if end is not None and end.tick == now.tick else None
     pairs: list[Sequence[RobotSetup]] = [*setup.pairs()]

@@ -23,9 +23,9 @@ const NEAR_PX = 0.5;
 const CAPTION_PX = 92, CAPTION_SHARE = 0.2, CLEAR_PX = 12;
 /** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
 const DRAG_PX = 4;
-/** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const VISIBLE_PX = 2; // the sensing range from which on poses and measurements can be told from the robots
 const ALL_DRAWN = 8; // robots that are all drawn, also those that are out of view
+/** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const LEAST_PX = 40;
 /** The largest group whose robots always have their names. */
 const NAMED = 20;
