@@ -26,7 +26,12 @@ from agent.estimation.facts import (
 )
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
-from agent.estimation.gaussian.joint_claims import decisive_ranges, displaced_anchor, undetermined
+from agent.estimation.gaussian.joint_claims import (
+    decisive_ranges,
+    displaced_anchor,
+    displacements,
+    undetermined,
+)
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements
 from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
@@ -314,7 +319,7 @@ def test_an_anchor_that_stands_elsewhere_than_surveyed_is_named(sigma: float) ->
     for known, name in ((group.facts.ordered, None), (moved, "Mr02")):
         measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
         found = search(measured)
-        displaced = displaced_anchor(found.hypotheses[0].fit, measured.some(found.located))
+        displaced = displaced_anchor(displacements(found.hypotheses[0].fit, measured.some(found.located)))
         assert (displaced.anchor if displaced is not None else None) == name
 
 

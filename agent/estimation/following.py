@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, strays
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
-from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor
+from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, displacements
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import begun, candidates, extended, search
 from agent.estimation.judged import Judged, User, misfit, of_joint
@@ -155,7 +155,7 @@ class Following(NamedTuple):
         if claiming:
             count = len(part.ranges.rho)
             if count >= RETESTED * tested or not claiming <= self.claimed:
-                tested, displaced = count, displaced_anchor(found.hypotheses[0].fit, part)
+                tested, displaced = count, displaced_anchor(displacements(found.hypotheses[0].fit, part))
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
         reasons = {name: blocked(one) for name, one in judged.items()}
         return self._replace(

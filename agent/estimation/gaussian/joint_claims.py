@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -89,9 +89,9 @@ def _worse_at(place: Array, k: int, fit: Fit, measured: JointMeasurements) -> fl
     return float(np.sum(worse / np.square(rows.sigma))) / fit.level
 
 
-def displaced_anchor(fit: Fit, used: JointMeasurements) -> Displacement | None:
-    """Return the anchor that most seems to stand elsewhere; None if none does."""
-    found = max(displacements(fit, used), key=lambda one: one.sigmas, default=None)
+def displaced_anchor(tested: Iterable[Displacement]) -> Displacement | None:
+    """Return that of the anchor which most seems to stand elsewhere; None if none does."""
+    found = max(tested, key=lambda one: one.sigmas, default=None)
     return found if found is not None and found.sigmas > DISPLACED_SIGMAS else None
 
 

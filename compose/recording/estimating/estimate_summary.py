@@ -11,7 +11,7 @@ import numpy as np
 
 from agent.estimation.fit import Fit
 from agent.estimation.following import ClaimRule
-from agent.estimation.gaussian.joint_claims import DISPLACED_SIGMAS, Displacement, displacements
+from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, displacements
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import INLIER
 from compose.recording.estimating.estimate_rows import (
@@ -135,8 +135,8 @@ def _anchors(
 
 def _doubtful(fit: Fit, used: JointMeasurements, displaced: Sequence[Displacement]) -> dict[str, str]:
     """Return why anchors seem to stand elsewhere: by a test, or since most of their ranges fit no other."""
-    most = max(displaced, key=lambda one: one.sigmas, default=None)
-    doubtful = {most.anchor: most.what} if most is not None and most.sigmas > DISPLACED_SIGMAS else {}
+    most = displaced_anchor(displaced)
+    doubtful = {most.anchor: most.what} if most is not None else {}
     anchors = np.array([pair[1] for pair in used.radios])[used.ranges.radio]
     for name in dict.fromkeys(anchors[np.isin(anchors, used.anchors)].tolist()):
         strays = fit.weights[anchors == name] <= INLIER
