@@ -168,14 +168,12 @@ def _prior(poses: Sequence[AnchorPlace | StartPose | None], of_start: float) -> 
         return None
     mean, information = np.zeros((len(poses), 3)), np.zeros((3 * len(poses), 3 * len(poses)))
     for k, one in enumerate(poses):
-        told = None
+        block = information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
         match one:
             case AnchorPlace(x, y, sigma):
-                mean[k, :2], told = (x, y), (sigma**-2, sigma**-2, 1.0)
+                mean[k, :2], block[:] = (x, y), np.diag((sigma**-2, sigma**-2, 1.0))
             case StartPose():
-                mean[k], told = one, (of_start**-2, of_start**-2, of_start**-2)
-        if told is not None:
-            information[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] = np.diag(told)
+                mean[k], block[:] = one, np.diag((of_start**-2, of_start**-2, of_start**-2))
     return prior_of(mean, information)
 
 
