@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from typing import TYPE_CHECKING
+
+from protocol.spelling import did_you_mean
 
 if TYPE_CHECKING:
     from protocol.messages import Outcome
@@ -130,6 +132,11 @@ class NoEstimate(UserError):
     """The numbers of a valid recording allow no estimate; the text names the recording and the time."""
 
     exit_status = NOT_LOCALISED
+
+
+def no_such(word: str, words: Collection[str]) -> str:
+    """Return the sentence for a `word` that is not one of `words`, with what there is."""
+    return f"there is no '{word}'; there are {', '.join(words)}{did_you_mean(word, words)}"
 
 
 def status_of(outcome: Outcome) -> int:

@@ -159,6 +159,8 @@ def test_robots_whose_clocks_jump_localise_in_real_time(tmp_path: Path) -> None:
 def test_a_clock_of_nobody_is_a_mistake(tmp_path: Path) -> None:
     with pytest.raises(BadScenario, match=r"^it: clock\[0\]\.who: there is no 'c'; there are a, b, world"):
         parse(PAPER_1 + '[[clock]]\nwho = "c"\n', "it")
+    with pytest.raises(BadScenario, match=r"^it: clock\[1\]\.who: 'a' has another \[\[clock\]\] already"):
+        parse(PAPER_1 + 2 * '[[clock]]\nwho = "a"\n', "it")
     (tmp_path / "it.toml").write_text(PAPER_1 + CLOCKS)
     refused = tandem("world", tmp_path / "it.toml", "--listen", "tcp/127.0.0.1:0")
     assert (refused.status, "clock: `tandem world` starts no robots" in refused.err) == (2, True)

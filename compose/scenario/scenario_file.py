@@ -11,7 +11,7 @@ from typing import Any
 
 import msgspec
 
-from compose.errors import BadFault, BadKill, BadScenario, Unworkable, within
+from compose.errors import BadFault, BadKill, BadScenario, Unworkable, no_such, within
 from compose.launch import model_loader, planner_loader
 from compose.launch.class_loader import trust
 from compose.scenario.fault_syntax import FaultTable, added, table_of
@@ -29,7 +29,6 @@ from protocol.motion import TAU, Pose
 from protocol.network.clock import ClockError
 from protocol.noise import with_profile
 from protocol.orbits import tick_budget
-from protocol.spelling import did_you_mean
 from protocol.wire import MalformedFrame, decode, encode
 from world.faults import Fault, delivery_time_bound
 from world.scenario import Death, RobotSpec, Scenario
@@ -91,20 +90,21 @@ class ScenarioTemplate(msgspec.Struct, frozen=True):
         ids = [robot.id for robot in self.file.robot]
         for kill in options:
             if kill.who not in (*ids, WORLD):
-                anyone = [*ids, WORLD]
-                near = f"{', '.join(anyone)}{did_you_mean(kill.who, anyone)}"
-                raise BadKill(f"--kill: {kill.text}: there is no '{kill.who}'; there are {near}")
+                raise BadKill(f"--kill: {kill.text}: {no_such(kill.who, [*ids, WORLD])}")
         return (*drawn(self.file.kill, seed, ids), *options)
 
     @property
     def clocks(self) -> dict[str, ClockError]:
         """The errors of the clocks of robots and of the world, by name. Raises BadScenario."""
         anyone = [*[robot.id for robot in self.file.robot], WORLD]
+        errors = dict[str, ClockError]()
         for i, one in enumerate(self.file.clock):
             if one.who not in anyone:
-                near = f"{', '.join(anyone)}{did_you_mean(one.who, anyone)}"
-                raise BadScenario(f"clock[{i}].who: there is no '{one.who}'; there are {near}")
-        return {one.who: ClockError(one.offset, one.drift, one.jumps) for one in self.file.clock}
+                raise BadScenario(f"clock[{i}].who: {no_such(one.who, anyone)}")
+            if one.who in errors:
+                raise BadScenario(f"clock[{i}].who: '{one.who}' has another [[clock]] already")
+            errors[one.who] = ClockError(one.offset, one.drift, one.jumps)
+        return errors
 
 
 def load(source: str, *, seed: int | None = None, faults: Sequence[str] = ()) -> Scenario:
