@@ -12,8 +12,7 @@ from typing import Annotated, Literal, cast, get_args
 import msgspec
 from msgspec import Meta
 
-from compose.errors import BadKill
-from protocol.spelling import did_you_mean
+from compose.errors import BadKill, no_such
 
 Point = Literal["observation", "report", "journal", "command"]
 """A point of a tick at which a process can be killed.
@@ -87,8 +86,7 @@ class KillTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         for name in named:
             who = draw.choice(anyone) if name == DRAWN_VALUE else name
             if who not in anyone:
-                near = did_you_mean(who, anyone)
-                raise BadKill(f"who: there is no '{who}'; there are {', '.join(anyone)}{near}")
+                raise BadKill(f"who: {no_such(who, anyone)}")
             point = draw.choice(KILL_POINTS) if self.point == DRAWN_VALUE else self.point
             found.append(parse(f"{who}@{tick}:{point}{after if self.after else ''}"))
         return found

@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec.structs import fields, replace
 
-from compose.errors import BadScenario, UserError
+from compose.errors import BadScenario, UserError, no_such
 from compose.launch import planner_loader
 from compose.scenario.scenario_file import template_of
 from compose.scenario.scenario_tables import LONGEST_NAME
 from protocol.noise import Noise
-from protocol.spelling import did_you_mean
 from protocol.units import Finite, RobotId
 from world.faults import Fault
 from world.scenario import PlacedAnchor, Scenario
@@ -90,8 +89,7 @@ def changed(scenario: Scenario, change: ScenarioChange, most_ticks: int) -> Chan
     before = values_of(scenario)
     unknown = next((one for one in change.robots if one not in before.robots), None)
     if unknown is not None:
-        near = did_you_mean(unknown, before.robots)
-        raise UserError(f"robots: there is no '{unknown}'; there are {', '.join(before.robots)}{near}")
+        raise UserError(f"robots: {no_such(unknown, before.robots)}")
     table = file_table(_with_values(scenario, before, change))
     for robot in table["robot"]:
         if (one := change.robots.get(robot["id"])) is not None:

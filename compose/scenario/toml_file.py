@@ -10,7 +10,7 @@ from typing import Any
 import msgspec
 from msgspec import inspect
 
-from compose.errors import NotToml
+from compose.errors import NotToml, no_such
 from protocol import documents, files
 from protocol.spelling import did_you_mean
 
@@ -55,7 +55,7 @@ def field_first(error: str, schema: type[msgspec.Struct]) -> str:
     quoted = re.search(r"'(.*)'", what, re.DOTALL)
     word = quoted[1] if quoted is not None else ""
     if what.startswith("invalid enum value") and (words := known_words(schema, where)):
-        what = f"there is no '{word}'; there are {', '.join(words)}{did_you_mean(word, words)}"
+        what = no_such(word, words)
     elif what.startswith("unknown field"):
         what += did_you_mean(word, known_words(schema, where))
     if "matching regex" in what:
