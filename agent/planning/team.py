@@ -100,8 +100,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         poses = state.poses
         world = [in_world(state, one) for one in poses]
         total = math.fsum([one.probability for one in poses])
-        if isinstance(state.verdict, Localised):
-            world = world or [state.verdict.pose]
+        world = world or ([state.verdict.pose] if isinstance(state.verdict, Localised) else [])
         judged = state.following.judged.get(state.config.robot)
         covariance = judged.localised.covariance if judged is not None and poses else None
         return Estimate(
