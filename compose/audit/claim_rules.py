@@ -20,7 +20,7 @@ from compose.recording.run import Run
 from protocol.messages import MissionEnd, Report
 from protocol.motion import Pose, travelled
 from world.referee import inaccuracy, mistake
-from world.scenario import RobotSpec
+from world.scenario import RobotSpec, Scenario
 
 TOUCHING = 1e-9
 """The part of the safety distance by which rounding may bring two robots nearer."""
@@ -48,10 +48,11 @@ def claim(run: Run) -> Checks:
 def distance(run: Run) -> Checks:
     """Check that no two robots came nearer than the safety distance, nor than they began.
 
-    Under noise, three sigmas of a range less: that is how well robots know it.
+    Under noise, three sigmas of a range less: that is how well robots know it. Robots whose sensors are not
+    what they were told, or among attackers, cannot keep it.
     """
     least = run.scenario.mission.safety_distance
-    if not least or (found := nearest(run)) is None:
+    if not least or not _as_told(run.scenario) or (found := nearest(run)) is None:
         return
     begun = [
         math.dist((one.x, one.y), (two.x, two.y)) for one, two in combinations(run.ticks[0].truth.poses, 2)
@@ -63,14 +64,23 @@ def distance(run: Run) -> Checks:
 
 
 def bound(run: Run) -> Checks:
-    """Check that a team without faults whose first robot searches is localised within its bound."""
+    """Check that a team whose first robot searches is localised within its bound.
+
+    It need not be with faults, attackers, robots that die, or sensors that are not what robots were told.
+    """
     scenario, end = run.scenario, run.end
-    searches = scenario.team is not None and scenario.team.diameter
+    searches = scenario.team is not None and scenario.team.diameter and _as_told(scenario)
     if end is None or not searches or scenario.faults or scenario.deaths or end.outcome != "localised":
         return
     took = end.tick * scenario.mission.period
     what = f"it takes {took:.6g} s until all are localised, expected at most {scenario.t_max:.6g} s"
     yield Violation("bound", end.tick, None, what) if took > scenario.t_max else None
+
+
+def _as_told(scenario: Scenario) -> bool:
+    """Return whether all data that robots have are as they were told: by their sensors, and by each other."""
+    changed = scenario.world_noise is not None or scenario.range_model is not None
+    return not changed and all(one.attack is None for one in scenario.robots)
 
 
 def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> Violation | None:
