@@ -164,3 +164,17 @@ def test_a_clock_of_nobody_is_a_mistake(tmp_path: Path) -> None:
     (tmp_path / "it.toml").write_text(PAPER_1 + CLOCKS)
     refused = tandem("world", tmp_path / "it.toml", "--listen", "tcp/127.0.0.1:0")
     assert (refused.status, "clock: `tandem world` starts no robots" in refused.err) == (2, True)
+
+
+@pytest.mark.parametrize(
+    ("clocks", "says"),
+    [
+        ('[[clock]]\nwho = "a"\n[[clock]]\nwho = "a"\n', "clock[1].who: 'a' has another [[clock]] already"),
+        (f'[[clock]]\nwho = "a"\njumps = {[[1.0, 1.0]] * 1001}\n', "clock[0]: jumps: more than 1000"),
+    ],
+    ids=["two of one robot", "too many jumps"],
+)
+def test_a_clock_that_no_process_could_have_is_a_mistake(clocks: str, says: str) -> None:
+    with pytest.raises(BadScenario) as bad:
+        parse(PAPER_1 + clocks, "mine.toml")
+    assert str(bad.value).startswith(f"mine.toml: {says}")

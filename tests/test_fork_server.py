@@ -17,6 +17,7 @@ from signal import SIGKILL, SIGSTOP
 
 import pytest
 
+from compose.errors import UserError
 from compose.launch import forked
 from compose.launch.forked import ForkServer
 from compose.launch.processes import free_endpoint
@@ -418,3 +419,12 @@ def test_a_question_that_nobody_answers_in_time_is_not_refused() -> None:
         router.declare_queryable("tandem/slow", asked.append)
         until(lambda: session.ask(link, "tandem/slow", 0.2) is None and asked, "it is asked, in vain")
         assert session.ask(link, "tandem/slow", 0.2) is None
+
+
+def test_a_process_whose_arguments_are_too_long_is_refused_and_the_server_goes_on() -> None:
+    server = forked.fork_server("os:getpid")
+    with pytest.raises(
+        UserError, match=r"^agent a: its arguments have \d+ bytes; at most 131072 are passed$"
+    ):
+        server.start("os:getpid", "tandem", "agent", "a", *["--kill", "journal@1"] * 10_000)
+    assert not server.gone

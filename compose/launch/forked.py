@@ -28,8 +28,12 @@ from typing import IO
 
 import msgspec
 
+from compose.errors import UserError
+
 REQUEST_BYTES = 1 << 18
 """The largest size of a request, which is more than a socket takes by default."""
+MOST_ARGUMENTS_BYTES = 1 << 17
+"""The largest size of the arguments of a process, as of one of Linux: kills are among them."""
 STREAMS = (0, 2)
 """The descriptors sent with a request for a process: its standard input and error."""
 KILL_S = 5.0
@@ -237,8 +241,13 @@ class ForkServer:
         """Fork a process that calls `main`, a module:function, with `arguments` in sys.argv.
 
         Its standard error goes to a file that the result reads, its standard output to /dev/null. `on_end` is
-        called in another thread when the process has ended.
+        called in another thread when the process has ended. Raises UserError if `arguments` are too long.
         """
+        if (size := sum([len(one.encode()) for one in arguments])) > MOST_ARGUMENTS_BYTES:
+            who = " ".join(arguments[:2])
+            raise UserError(
+                f"{who}: its arguments have {size} bytes; at most {MOST_ARGUMENTS_BYTES} are passed"
+            )
         ours, its = socket.socketpair()
         errors = tempfile.TemporaryFile()  # noqa: SIM115  # closed by the process
         with its, self._lock:

@@ -32,6 +32,11 @@ class ClockError(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Pairs of the time in s after the start at which it jumps, and by how many s: ahead, or back if
     negative."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if there are more jumps than can be added up whenever the time is read."""
+        if len(self.jumps) > 1000:
+            raise ValueError("jumps: more than 1000")
+
     def arguments(self, since: float) -> list[str]:
         """Return the flag that tells a process of its clock's error, which starts at time `since` in s."""
         return ["--clock", msgspec.json.encode((self, since)).decode()]
