@@ -46,7 +46,7 @@ from compose.recording.ranging.range_recording import (
 )
 from compose.recording.ranging.range_steps import dead_reckoned, relative
 from compose.view.epochs import write_player
-from compose.view.played_estimate import read_player
+from compose.view.played_estimate import PLAYER_JSON, read_player
 from compose.view.recorded import scenes as recorded_scenes
 from docs import recorded_claims
 from protocol.motion import Pose, step, travelled
@@ -575,6 +575,18 @@ def test_the_page_plays_an_estimate_as_a_run_in_which_claims_and_hypotheses_are_
     assert texts[-1] == "Both are localised: each knows its position and its heading."
     ranged = sum([len(player.anchors) for scene in scenes.values() for player in scene.players])
     assert ranged == of_sample.summary.ranges["A-LC0"] + of_sample.summary.ranges["B-LC1"]
+    text, file = (tmp_path / PLAYER_JSON).read_text(), tmp_path / PLAYER_JSON
+    for was, new, says in [
+        ('"mode":"estimate"', '"mode":null', "setup: it is not of an estimate"),
+        ('{"id":"B"', '{"id":"A"', "setup.robots: there are none, or two of one name"),
+        ('"tick":1,', '"tick":9,', "epochs: their ticks do not increase to that of the end"),
+        ('["observation",1,"A"', '["observation",1,"z"', "epochs: something is of another robot or tick"),
+    ]:
+        assert was in text
+        file.write_text(text.replace(was, new, 1))
+        with pytest.raises(UserError) as bad:
+            read_player(tmp_path)
+        assert str(bad.value) == f"{file} cannot be read: {says}"
 
 
 def test_the_command_writes_a_table_a_summary_and_figures(tmp_path: Path) -> None:

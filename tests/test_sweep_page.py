@@ -18,7 +18,7 @@ from compose.scenario.scenario_file import load
 from compose.view.outlines import box
 from compose.view.recorded import run_data
 from compose.view.web.requested_work import RequestedWork
-from compose.view.web.reruns import Trials
+from compose.view.web.reruns import Trials, over_time
 from compose.view.web.thumbnail import HEIGHT, WIDTH, thumbnail
 from tests.browser import Open, shot, watching
 from tests.commands import BOUND_S, TandemProcess
@@ -76,6 +76,14 @@ def test_the_slider_shows_how_many_trials_have_localised_by_a_tick(opened: Open,
         expect(shares).to_have_text(["25 %", "0 %", "0 %"])
         slider.evaluate(SCRUB_TO, "20")
         expect(shares).to_have_text(["25 %", "25 %", "0 %"])
+
+
+@pytest.mark.parametrize("ticks", ["many", [1], 2**62, float("nan")])
+def test_a_table_of_trials_with_other_ticks_is_refused_in_a_line(ticks: object, tmp_path: Path) -> None:
+    trials = {"cell": [0], "ticks": [ticks], "outcome": ["localised"]}
+    pq.write_table(pa.table(trials), tmp_path / "trials.parquet")
+    with pytest.raises(UserError, match=r"^[^\n]*: trials\.parquet cannot be read: [^\n]+$"):
+        over_time(str(tmp_path))
 
 
 @pytest.mark.long

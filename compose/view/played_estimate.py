@@ -11,11 +11,12 @@ from pathlib import Path
 import msgspec
 
 from compose.errors import UserError
-from compose.recording.run_setup import RunSetup
+from compose.recording.run_setup import ESTIMATED, RunSetup
 from compose.view.run_data import RunData
 from protocol import documents, files
 from protocol.messages import Command, Estimate, MissionEnd, Observation
 from protocol.motion import Pose
+from protocol.units import Tick
 
 PLAYER_JSON = "player.json"
 """The file in the folder of an estimate."""
@@ -24,7 +25,7 @@ PLAYER_JSON = "player.json"
 class Epoch(msgspec.Struct, frozen=True):
     """One epoch: the true poses that are known, and the messages of all robots."""
 
-    tick: int
+    tick: Tick
     truth: dict[str, Pose]
     messages: list[Observation | Command | Estimate]
 
@@ -35,6 +36,21 @@ class PlayedEstimate(msgspec.Struct, frozen=True):
     setup: RunSetup
     epochs: list[Epoch]
     end: MissionEnd
+
+    def __post_init__(self) -> None:
+        """Raise ValueError for what no estimate has."""
+        ids, known = self.setup.ids, {*self.setup.ids}
+        ticks = [one.tick for one in self.epochs]
+        told = {(one.tick, each.tick, each.robot) for one in self.epochs for each in one.messages}
+        told |= {(one.tick, one.tick, robot) for one in self.epochs for robot in one.truth}
+        if not self.setup.team or self.setup.visits or self.setup.mode != ESTIMATED:
+            raise ValueError("setup: it is not of an estimate")
+        if not ids or len(known) < len(ids):
+            raise ValueError("setup.robots: there are none, or two of one name")
+        if not ticks or ticks != sorted({*ticks}) or ticks[-1] != self.end.tick:
+            raise ValueError("epochs: their ticks do not increase to that of the end")
+        if any(tick != own or robot not in known for tick, own, robot in told):
+            raise ValueError("epochs: something is of another robot or tick")
 
     def run_data(self) -> RunData:
         """Return the data of all epochs."""

@@ -19,6 +19,7 @@ from compose.scenario.scenario_change import ChangedScenario, ScenarioChange, ch
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.sources import Recorded, WatchedRun
 from protocol import documents, files
+from protocol.output import one_line
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from world.scenario import Scenario
 
@@ -229,13 +230,15 @@ def run_worst(folder: str, cell: int, out: str) -> tuple[str, int, int]:
 def over_time(folder: str) -> dict[str, Any]:
     """Return the numbers of trials that are localised by certain ticks, by the cell. Raises UserError."""
     import numpy as np  # noqa: PLC0415
-    import pyarrow.parquet as pq  # noqa: PLC0415  # optional, and slow to import
+    import pyarrow as pa  # noqa: PLC0415  # optional, and slow to import
+    import pyarrow.parquet as pq  # noqa: PLC0415
 
     try:
         table = BytesIO(files.read_inside(Path(folder), TRIALS, most=MOST_TABLE_BYTES))
         found = pq.read_table(table, columns=["cell", "ticks"], filters=[("outcome", "=", "localised")])
-    except (OSError, ValueError) as error:
-        raise UserError(f"{folder}: {TRIALS} cannot be read: {error}") from None
+        found = found.cast(pa.schema({"cell": pa.int32(), "ticks": pa.int32()})).drop_null()
+    except (OSError, ValueError, NotImplementedError, TypeError) as error:
+        raise UserError(one_line(f"{folder}: {TRIALS} cannot be read: {error}")) from None
     cells, ticks = (np.asarray(found[name]) for name in ("cell", "ticks"))
     last = int(ticks.max(initial=0))
     steps = np.unique(np.linspace(0, last, min(last + 1, MOST_STEPS)).astype(int))

@@ -85,6 +85,8 @@ class _Answers:
         """Held while a request is computed: one at a time."""
         self._waiting = 0
         """The number of requests that are computed, or wait until they are."""
+        self._costing = asyncio.Lock()
+        """Held while the costs of one mission are computed."""
         self._costs: dict[str, asyncio.Task[None]] = {}
         """The computations of what faults have cost, by the name of the mission."""
 
@@ -171,7 +173,8 @@ class _Answers:
         return _json(show.mission)
 
     async def _add_costs(self, show: WatchedRun) -> None:
-        show.known.add_costs(await asyncio.to_thread(self._site.costs_of, show))
+        async with self._costing:  # else the costs of many missions take all threads from requests
+            show.known.add_costs(await asyncio.to_thread(self._site.costs_of, show))
         show.revised()
 
     async def thumbnail(self, request: Request) -> Response:
