@@ -45,6 +45,7 @@ from world.hardware.driver import Reading
 from world.hardware.measurements import InvalidReading, observation_frame
 from world.scenario import Scenario
 from world.tick import World, advance, observations, release
+from world.world_noise import WorldNoise
 
 SHIPPED = ("room", "relative")
 MISSION = """
@@ -187,6 +188,8 @@ def test_robots_that_come_too_near_and_a_search_that_takes_too_long_are_violatio
         other = replace(run, world=replace(history, scenario=changed))
         (found,) = [one for one in rule(other) if one is not None]
         assert found.rule == rule.__name__
+        untold = replace(changed, world_noise=WorldNoise(mutual_sigma=0.5))  # nothing is promised then
+        assert not any(rule(replace(run, world=replace(history, scenario=untold))))
 
 
 KILLS = ("a@2 world@4", "", "b@1:command b@3:report world@0")

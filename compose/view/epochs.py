@@ -10,6 +10,7 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
+from agent.estimation.gaussian.odometry_noise import Places
 from compose.recording.estimating.estimate_rows import FinalHypothesis, PoseEstimateRow
 from compose.recording.estimating.estimate_run import RecordingEstimate
 from compose.recording.estimating.recorded_measurements import EPOCH_S, Measurements
@@ -34,11 +35,19 @@ from protocol.noise import Noise
 
 def played(problem: Measurements, estimate: RecordingEstimate) -> PlayedEstimate:
     """Return an estimate as a run, whose sensing range is the longest range that was measured."""
-    epochs = [_epoch(problem, 0, problem.t0, (), ())]
+    ranges = problem.joint.ranges
+    order = ranges.tick.argsort(kind="stable")
+    of_epoch = -(ranges.tick[order] // -problem.ticks_per_epoch)  # rounded up
+
+    def measured(tick: int) -> Places:
+        """Return the rows of the ranges that end in the epoch `tick`."""
+        return np.sort(order[slice(*np.searchsorted(of_epoch, (tick, tick + 1)))])
+
+    epochs = [_epoch(problem, 0, problem.t0, measured(0), (), ())]
     for one in estimate.epochs:
         tick = max(round((one.t - problem.t0) / EPOCH_S), epochs[-1].tick + 1)
-        epochs.append(_epoch(problem, tick, one.t, one.rows, one.hypotheses))
-    ranges, last, why = problem.joint.ranges, epochs[-1].tick, estimate.summary.blocking_reason
+        epochs.append(_epoch(problem, tick, one.t, measured(tick), one.rows, one.hypotheses))
+    last, why = epochs[-1].tick, estimate.summary.blocking_reason
     sigma, longest = (float(np.max(one, initial=1e-3)) for one in (ranges.sigma, ranges.rho))
     localised = bool(estimate.epochs) and all(estimate.epochs[-1].claims)
     anchors = [
@@ -64,17 +73,20 @@ def _epoch(
     problem: Measurements,
     tick: int,
     t: float,
+    measured: Places,
     rows: Sequence[PoseEstimateRow],
     hypotheses: Sequence[FinalHypothesis],
 ) -> Epoch:
-    """Return an epoch that ends at `t` s: what each robot has measured in it, and holds at its end."""
+    """Return an epoch that ends at `t` s: what each robot has measured in it, and holds at its end.
+
+    `measured` are the rows of its ranges.
+    """
     ids, held = [one.id for one in problem.robots], {row.robot: row for row in rows}
     epoch = Epoch(tick, {}, [])
     contacts: dict[str, dict[str, Contact]] = defaultdict(dict)
     anchors: dict[str, dict[str, NamedRange]] = defaultdict(dict)
-    ranges, per = problem.joint.ranges, problem.ticks_per_epoch
-    inside = (ranges.tick > (tick - 1) * per) & (ranges.tick <= tick * per) & (ranges.radio >= 0)
-    for i in np.flatnonzero(inside):
+    ranges = problem.joint.ranges
+    for i in measured[ranges.radio[measured] >= 0]:
         first, second = problem.joint.radios[int(ranges.radio[i])]
         for robot, other in ((first, second), (second, first)):
             if robot in ids and other in ids:
@@ -83,7 +95,7 @@ def _epoch(
                 anchors[robot][other] = NamedRange(other, float(ranges.rho[i]))
     for one in problem.robots:
         robot, row = one.id, held.get(one.id)
-        measured = (*contacts[robot].values(),), (), (*anchors[robot].values(),)
+        ranged = (*contacts[robot].values(),), (), (*anchors[robot].values(),)
         poses = tuple([Pose(*each.poses[robot]) for each in hypotheses] if row is not None else [])
         covariance, verdict, state = None, None, "unlocated"
         if row is not None:
@@ -94,7 +106,7 @@ def _epoch(
         shares = tuple([min(each.probability / total, 1.0) for each in hypotheses] if poses else [])
         epoch.messages.extend(
             [
-                Observation(tick, robot, _driven(problem, robot, tick), None, *measured),
+                Observation(tick, robot, _driven(problem, robot, tick), None, *ranged),
                 Command(tick, robot, 0.0, 0.0, 3 if poses else 1, state, verdict),
                 Estimate(tick, robot, (), poses, verdict is not None, shares, covariance),
             ]
