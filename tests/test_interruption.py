@@ -70,7 +70,7 @@ def signalled(module: str, number: Signals, *words: str | Path) -> Ended:
 
 
 @pytest.mark.parametrize(
-    "module", series(["argparse", "tandem.clash", "compose.cli.main", "compose.cli.commands"], 2)
+    "module", series(["argparse", "datetime", "tandem.clash", "compose.cli.main", "compose.cli.commands"], 2)
 )
 def test_ctrl_c_while_tandem_starts_ends_it_without_output(module: str) -> None:
     assert signalled(module, SIGINT, "scenarios") == (130, "", "")
