@@ -775,6 +775,9 @@ class FinalReport(Message, frozen=True):
     """The number of refused frames of all kinds."""
     bytes_sent: Count
     """The total size of the Reports sent, in bytes."""
+    unverified_anchors: Annotated[dict[RobotId, Text], Meta(max_length=MAX_MEMBERS)] = {}
+    """The anchors of a team of which no range tells whether they stand as far off as `accuracy`, with the
+    direction: across the line of the only two, for instance. Empty for others, and before a claim."""
 
     def __post_init__(self) -> None:
         _cut(self, "blocking_reason")

@@ -75,6 +75,8 @@ def team(robots: str, anchors: str = ANCHORS, mission: str = MISSION, more: str 
     return parse(f'name = "team"\nseed = 1\n{more}\n{mission}\n{anchors}\n{robots}', "team")
 
 
+IN_A_LINE = ANCHORS.rpartition("[[anchor]]")[0]
+"""Two anchors: across their line, no range tells where they stand."""
 ALONE = '[[robot]]\nid = "a"\nstart = [1.0, 1.0, 0.5]'
 
 
@@ -128,6 +130,18 @@ def test_an_anchor_off_its_survey_is_named_before_its_ranges_pass_as_strays() ->
     assert run.end is not None
     assert run.end.outcome == "undecided"
     assert any("anchor A1 seems to stand elsewhere" in (one.text or "") for one in run.end.causes)
+
+
+def test_a_claim_says_across_which_line_of_anchors_no_range_tells_where_they_stand(tmp_path: Path) -> None:
+    for anchors, unverified in ((IN_A_LINE, ["A1", "A2"]), (ANCHORS, [])):
+        found = run_mission(team(ALONE, anchors, EXACT)).final_reports["a"].unverified_anchors
+        assert list(found) == unverified
+        assert all(
+            "off along (-0.00, 1.00)" in why or "off along (0.00, 1.00)" in why for why in found.values()
+        )
+    (tmp_path / "line.toml").write_text(f'name = "line"\nseed = 1\n{EXACT}{IN_A_LINE}{ALONE}')
+    said = tandem_command("run", tmp_path / "line.toml", "--in-process")
+    assert "no range tells whether A1, A2 stand elsewhere than told" in said.out
 
 
 def test_an_anchor_with_three_ranges_from_one_line_is_not_said_to_stand_at_their_mirror_image() -> None:

@@ -82,8 +82,8 @@ class Following(NamedTuple):
     """The decisive ranges with which robots were not located."""
     claimed: frozenset[str] = frozenset()
     """The robots that might have claimed their poses."""
-    displaced: Displacement | None = None
-    """The anchor that seems to stand elsewhere, at the latest test."""
+    displacements: tuple[Displacement, ...] = ()
+    """How far each anchor seems to stand elsewhere, at the latest test."""
     tested: int = 0
     """The number of ranges at that test."""
     begun_again: int = 0
@@ -151,17 +151,18 @@ class Following(NamedTuple):
         }
         first = {name: blocked(one, BEFORE_SEARCH) for name, one in judged.items()}
         claiming = {name for name, one in first.items() if one is None or one.condition in DISPLACED}
-        displaced, tested = self.displaced, self.tested
+        shifts, tested = self.displacements, self.tested
         if claiming:
             count = len(part.ranges.rho)
             if count >= RETESTED * tested or not claiming <= self.claimed:
-                tested, displaced = count, displaced_anchor(displacements(found.hypotheses[0].fit, part))
+                tested, shifts = count, tuple(displacements(found.hypotheses[0].fit, part))
+            displaced = displaced_anchor(shifts)
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
         reasons = {name: blocked(one) for name, one in judged.items()}
         return self._replace(
             part=part,
             judged=judged,
             reasons={name: one.reason if one is not None else "" for name, one in reasons.items()},
-            displaced=displaced,
+            displacements=shifts,
             tested=tested,
         )

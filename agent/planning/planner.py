@@ -11,7 +11,7 @@ are identical to the bit. A planner is a subclass of `Planner`. Its instances ho
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -53,6 +53,8 @@ class Summary(msgspec.Struct, frozen=True):
     """The condition that still prevents a claim, for a user."""
     p_value: Probability | None = None
     """The smallest p-value of all consistency tests."""
+    unverified_anchors: Mapping[str, str] = {}
+    """The anchors of which no range tells whether they stand elsewhere than told, with the direction."""
 
 
 class Planner(Generic[S, B]):

@@ -129,4 +129,5 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
             probability=min(poses[0].probability / total, 1.0) if noisy and poses else None,
             blocking_reason=state.joint.why_not or None if noisy and state.verdict is None else None,
             p_value=p_value if noisy else None,
+            unverified_anchors=state.unverified_anchors,
         )

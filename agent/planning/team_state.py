@@ -18,7 +18,7 @@ from agent.estimation.posterior import Hypothesis, certainties, same
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import TeamLog
 from agent.planning.agenda import Bypass
-from protocol.messages import RobotConfig, SurveyedAnchor, Team, Undecided, Verdict
+from protocol.messages import Localised, RobotConfig, SurveyedAnchor, Team, Undecided, Verdict
 from protocol.mission import Anchor
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, relative, wrap
 from protocol.orbits import Orbit
@@ -163,6 +163,13 @@ class TeamState(msgspec.Struct, frozen=True):
             if not any(same(one.fit, other.hypothesis.fit)[place or 0] for other in found):
                 found.append(LikelyPose(one.probability, one))
         return found
+
+    @property
+    def unverified_anchors(self) -> dict[str, str]:
+        """The anchors of which no range tells whether they stand elsewhere, and why; none before a claim."""
+        tested = self.following.displacements if isinstance(self.verdict, Localised) else ()
+        accuracy = self.config.mission.accuracy
+        return {one.anchor: reason for one in tested if (reason := one.unverified(accuracy))}
 
     @property
     def waiting_here(self) -> bool:

@@ -61,6 +61,9 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
         say(*text_width.wrapped(_bound(group, robots)))
     if late:
         say(*text_width.wrapped(_missed(late, summary["ticks"], rate)))
+    claiming = [set(one["unverified_anchors"] or ()) for one in robots.values() if one["localised"]]
+    if claiming and (anchors := sorted(set.intersection(*claiming))):
+        say(*text_width.wrapped(_unverified(anchors)))
 
 
 def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) -> str:
@@ -77,19 +80,27 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
         return f"all robots were localised by tick {last}; {bound}"
     if last is None:
         return f"no robot is localised; {bound}"
-    names = ", ".join(left[:MOST_NAMED_ROBOTS]) + (
-        f" and {len(left) - MOST_NAMED_ROBOTS} more" if len(left) > MOST_NAMED_ROBOTS else ""
-    )
-    return f"all robots but {names} were localised by tick {last}; {bound}"
+    return f"all robots but {_named(left, 'robots')} were localised by tick {last}; {bound}"
+
+
+def _unverified(anchors: Sequence[str]) -> str:
+    """Return the sentence on the anchors of which no range tells whether they stand elsewhere than told."""
+    named = _named(anchors, "anchors")
+    return f"no range tells whether {named} stand elsewhere than told; summary.json has the directions"
+
+
+def _named(names: Sequence[str], what: str) -> str:
+    """Return at most MOST_NAMED_ROBOTS of `names`, and the number of further ones, which are `what`."""
+    more = len(names) - MOST_NAMED_ROBOTS
+    return ", ".join(names[:MOST_NAMED_ROBOTS]) + (f" and {more} more {what}" if more > 0 else "")
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
     """Return the sentence on missed deadlines: the number of each robot, and the advice."""
     worst = sorted(late.items(), key=lambda one: -one[1])
-    names = ", ".join([f"{name} {missed}" for name, missed in worst[:MOST_NAMED_ROBOTS]])
-    more = f" and {len(worst) - MOST_NAMED_ROBOTS} more robots" if len(worst) > MOST_NAMED_ROBOTS else ""
+    names = _named([f"{name} {missed}" for name, missed in worst], "robots")
     slower = f", such as --rate {rate / 2:g}," if rate is not None else ""
-    return f"deadlines missed, of {ticks}: {names}{more}; a lower --rate{slower} gives each robot more time"
+    return f"deadlines missed, of {ticks}: {names}; a lower --rate{slower} gives each robot more time"
 
 
 def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:

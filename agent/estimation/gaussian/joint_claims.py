@@ -42,9 +42,10 @@ class Displacement(NamedTuple):
         if DISPLACED_SIGMAS * self.open_sigma < displaced:
             return ""
         x, y = self.open_along
-        return (
-            f"no range tells whether it stands {displaced:.2g} m off along ({x:.2f}, {y:.2f}): its position "
-            f"has a sigma of {self.open_sigma:.2g} m in that direction"
+        return f"no range tells whether it stands {displaced:.2g} m off along ({x:.2f}, {y:.2f}): " + (
+            f"its position has a sigma of {self.open_sigma:.2g} m in that direction"
+            if math.isfinite(self.open_sigma)
+            else "too few ranges determine its position"
         )
 
 
