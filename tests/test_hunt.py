@@ -152,7 +152,7 @@ def test_a_mistake_of_the_user_has_its_own_status(tmp_path: Path) -> None:
 
 
 def test_ctrl_c_ends_a_hunt_with_what_it_has_reached(tmp_path: Path) -> None:
-    with TandemProcess("hunt", "paper-1", "--minutes", "9", "--workers", "1", cwd=tmp_path) as hunting:
+    with TandemProcess("hunt", "paper-1", "--minutes", "9", "--jobs", "1", cwd=tmp_path) as hunting:
         hunting.until_prints("inputs to begin with")
         hunting.tell(signal.SIGINT)
         ended = hunting.ended()

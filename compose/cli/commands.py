@@ -33,6 +33,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--days": arguments.up_to(36_500),
     "--format": FIGURE_FORMATS,
     "--clock": arguments.clock,
+    "--jobs": arguments.up_to(1000),
     "--kill": arguments.kill,
     "--model": arguments.model,
     "--only": PICTURES,
@@ -270,7 +271,7 @@ COMMANDS = (
         f"""{SCENARIO}
         --minutes M = 5: wall time of the search in minutes [default: %(default)g]
         | --runs N: number of runs instead, in batches of 16, after which it ends
-        --workers N: worker processes, 1 to 1000 [default: one per core]
+        --workers --jobs N: worker processes, 1 to 1000 [default: one per core]
         --seed N = 0: seed of all draws, 0 to 2^63 - 1 [default: %(default)s]
         --out FILE: scenario file that is written if something is found [default: hunt-SCENARIO.toml]
         -q --quiet: print only the results
