@@ -6,12 +6,14 @@ import math
 import signal
 import tomllib
 from collections.abc import Callable
+from itertools import zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from agent.estimation import claim
 from agent.planning import phase3_last_manoeuvre
 from agent.process.node import AgentProcess
 from compose.cli import hunt as command
@@ -20,9 +22,13 @@ from compose.launch import in_process, virtual_processes
 from compose.scenario.kills import KILL_POINTS
 from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
-from compose.sweep.hunt.examination import examined, scenario_of
+from compose.sweep import spec
+from compose.sweep.cells import cells
+from compose.sweep.hunt import coverage
+from compose.sweep.hunt.examination import MOST_TICKS, examined, scenario_of, watched
 from compose.sweep.hunt.exploration import Hunt
 from compose.sweep.hunt.mutation import fault_lines, simpler
+from compose.sweep.hunt.mutation import seeds as hunted
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.messages import Observation
 from tests.commands import TandemProcess, tandem
@@ -125,6 +131,50 @@ def test_a_hunt_compares_distances_with_the_safety_distance(monkeypatch: pytest.
     assert [one.kind for one in examined({**table, "seed": NEAR}).breaches] == []
     monkeypatch.setattr(phase3_last_manoeuvre, "nearest", lambda _, v, *__: np.full(v.shape, math.inf))
     assert "audit: distance" in [one.kind for one in examined({**table, "seed": NEAR}).breaches]
+
+
+def changed(source: str, **fields: dict[str, Any]) -> dict[str, Any]:
+    """Return the table of a shipped scenario with further fields in its tables."""
+    table = scenario_table(source)
+    return {**table, **{name: {**table.get(name, {}), **one} for name, one in fields.items()}}
+
+
+def cell(sweep: str, number: int) -> dict[str, Any]:
+    """Return the table of a cell of a shipped sweep."""
+    return dict(list(cells(spec.load(sweep)))[number].table)
+
+
+RARE = [
+    {**scenario_table("random"), "fault": [{"corrupt": 0.4, "duplicate": 0.4, "delay": [0, 3]}]},
+    changed("noisy", mission={"noise": {"anchor_sigma": 0.1, "mutual_sigma": 0.1, "drop_outs": 0.3}}),
+    cell("group-unanchored", 0),
+    cell("mismatch-uwb", 3),
+    cell("noise", 8) | {"seed": 2},
+    changed("room", world={"noise": {"outliers": 0.3, "outlier_bias": [0.5, 2.0]}}) | {"max_ticks": 60},
+]
+"""Inputs with what the sweeps of their scenarios do not have."""
+SOURCES = ("random-group", "random", "noisy", "room", "relative")
+GUARDS = {"hypothesis", "definite covariance", "determined position"}
+"""The conditions that no mission was found to reach. tests/test_claim.py has them."""
+
+
+@pytest.mark.long
+def test_every_task_condition_and_kind_of_message_is_reached_in_some_mission(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(claim, "Blocked", claim.Blocked)  # it is the one of before after this test
+    coverage.note_conditions()
+    seen: set[str] = set()
+    left = coverage.never(seen)
+    inputs = [*RARE, *[one for each in zip_longest(*map(hunted, SOURCES)) for one in each if one is not None]]
+    for table in inputs:
+        scenario, _, _ = scenario_of(table)
+        if scenario.max_ticks * len(scenario.robots) <= MOST_TICKS:
+            seen |= coverage.reached(watched(scenario, seen)[0])[0]
+            left = coverage.never(seen)
+        if not (left["tasks"] or left["messages"] or {*left["conditions"]} - GUARDS):
+            break
+    assert (left["tasks"], left["messages"], {*left["conditions"]} - GUARDS) == ([], [], set())
 
 
 @pytest.mark.long

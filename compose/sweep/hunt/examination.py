@@ -52,14 +52,10 @@ def examined(table: dict[str, Any]) -> Examined:
     if scenario.max_ticks * len(scenario.robots) > MOST_TICKS:
         return Examined(refused="it could last too long")
     seen: set[str] = set()
-    sinks, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
     try:
-        in_process.played(
-            scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen)), messages.encode
-        )
+        run, sinks = watched(scenario, seen)
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
-    run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
     again = _again(scenario, kills, clocks, sinks)
     found, moments = reached(run)
     every = [*again, *breaches(run, replayed=not again)]
@@ -69,6 +65,15 @@ def examined(table: dict[str, Any]) -> Examined:
     return Examined(
         tuple(every), frozenset(found), Clues(ids, run.length - 1, moments), max(shares, default=0.0)
     )
+
+
+def watched(scenario: Scenario, seen: set[str]) -> tuple[Run, dict[str, MemoryJournal]]:
+    """Return a run of `scenario` in this process with its journals; `seen` are the conditions not met."""
+    sinks, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
+    in_process.played(
+        scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen)), messages.encode
+    )
+    return of_frames({name: one.frames for name, one in sinks.items()}, messages=messages), sinks
 
 
 def _task(run: Run, kill: Kill) -> str:
