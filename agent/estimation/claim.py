@@ -62,6 +62,8 @@ class Condition(NamedTuple):
     name: str
     users: frozenset[User]
     """The users whom it concerns."""
+    last: bool
+    """True if it is asked once all others hold: after a search of the whole plane, and a test of anchors."""
     blocks: Callable[[Judged], str]
     """Return why the condition is not met; an empty text if it is.
 
@@ -69,9 +71,9 @@ class Condition(NamedTuple):
     """
 
 
-def condition(*users: User) -> Callable[[Callable[[Judged], str]], Condition]:
+def condition(*users: User, last: bool = False) -> Callable[[Callable[[Judged], str]], Condition]:
     """Return a decorator that makes a function a condition, whose name it has."""
-    return lambda blocks: Condition(blocks.__name__.replace("_", " "), frozenset(users), blocks)
+    return lambda blocks: Condition(blocks.__name__.replace("_", " "), frozenset(users), last, blocks)
 
 
 @condition(*EVERYBODY)
@@ -180,7 +182,7 @@ def evidence(judged: Judged) -> str:
     )
 
 
-@condition(*FIRST_CLAIMS)
+@condition(*FIRST_CLAIMS, last=True)
 def early_consistency(judged: Judged) -> str:
     """That p-value is at least {EARLY_CLAIM_P_VALUE:g} with fewer ranges than {EARLY_RANGES}."""
     found = judged.inconsistency
@@ -190,7 +192,7 @@ def early_consistency(judged: Judged) -> str:
     return f"the fit is too improbable for so few ranges: {found.what}"
 
 
-@condition("recording", "team")
+@condition("recording", "team", last=True)
 def anchors(judged: Judged) -> str:
     """No anchor seems to stand {DISPLACED_SIGMAS:g} sigmas or more from where it was surveyed."""
     found = judged.displaced
@@ -199,7 +201,7 @@ def anchors(judged: Judged) -> str:
     return f"anchor {found.anchor} seems to stand elsewhere than surveyed: {found.what}"
 
 
-@condition(*FIRST_CLAIMS)
+@condition(*FIRST_CLAIMS, last=True)
 def profiles(judged: Judged) -> str:
     """No profile of common sensors explains the measurements much better than the assumed noise.
 
@@ -213,7 +215,7 @@ def profiles(judged: Judged) -> str:
     return found.reason("--noise {}" if judged.user == "recording" else 'noise = "{}"')
 
 
-@condition("assured", "finder", "unanchored", "team")
+@condition("assured", "finder", "unanchored", "team", last=True)
 def rivals(judged: Judged) -> str:
     """Poses {WRONG_SIGMAS:g} sigmas away are at most 1 - `confidence` times as likely.
 
@@ -229,8 +231,9 @@ def rivals(judged: Judged) -> str:
     )
 
 
-BEFORE_SEARCH = (
+CONDITIONS = (
     hypothesis,
+    anchors,
     ranges,
     probability,
     convergence,
@@ -241,11 +244,14 @@ BEFORE_SEARCH = (
     position,
     heading,
     evidence,
+    early_consistency,
+    profiles,
+    rivals,
 )
-"""The conditions that a robot asks in each tick. If they hold, it searches the whole plane, and asks all."""
-
-CONDITIONS = (hypothesis, anchors, *BEFORE_SEARCH[1:], early_consistency, profiles, rivals)
 """All conditions for a claim, cheap ones first: which anchor is displaced has been found out before."""
+
+BEFORE_SEARCH = tuple([one for one in CONDITIONS if not one.last])
+"""The conditions that a robot asks in each tick. If they hold, it searches the whole plane, and asks all."""
 
 
 class Blocked(NamedTuple):
