@@ -15,7 +15,7 @@ from agent.estimation.claim import NORMAL_RATIO, Blocked, blocked, claim, consis
 from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
-from agent.estimation.judged import Judged, of_pair
+from agent.estimation.judged import Judged, User, of_pair
 from agent.estimation.knowledge import Knowledge
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow, settled
 from agent.planning.state import RobotState
@@ -52,6 +52,9 @@ an anchor count less.
 SMALLEST_LOSS = 1e-6
 """The smallest difference of log-likelihoods by which another one is divided."""
 
+Estimated = tuple[tuple[Hypothesis, ...], Judged | None]
+"""The hypotheses about a pair, and the first of them as the conditions of a claim see it."""
+
 
 def updated(state: RobotState) -> RobotState:
     """Return `state` with a new estimate of the pose, if one is due."""
@@ -70,8 +73,8 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     describes, so there must be RANGES_AGAIN. If poses many sigmas away are likelier than the ellipse says,
     the covariance is widened until it says as much, but at most by MOST_WIDENED.
     """
-    scored, judged = _estimate(state, searched=True)
-    state = _with_estimate(state, scored, judged)
+    found, judged = _estimate(state, searched=True)
+    state = _with_estimate(state, found, judged)
     reference = _reference(state, judged)
     return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
 
@@ -86,17 +89,21 @@ def beacon_place(state: RobotState) -> Place:
     return state.config.m1.x + x, state.config.m1.y + y
 
 
-def _estimate(state: RobotState, *, searched: bool) -> tuple[tuple[Hypothesis, ...], Judged | None]:
-    """Return the hypotheses by all measurements of the latest meeting, and the first one as `claim` sees it.
+def _estimate(state: RobotState, *, searched: bool) -> Estimated:
+    """Return the estimate by all measurements of the latest meeting."""
+    return _estimated("finder", state, _measured(state), searched=searched)
 
-    The whole plane is searched if the known hypotheses do not explain the measurements, or if `searched`.
+
+def _estimated(user: User, known: Knowledge, measured: JointMeasurements, *, searched: bool) -> Estimated:
+    """Return the hypotheses by what was `measured`, and the first one as `claim` sees it for `user`.
+
+    The whole plane is searched if the `known` hypotheses do not explain it, or if `searched`.
     """
-    measured = _measured(state)
-    found = settled(Posterior(PAIR, state.belief.pair), measured)
-    judged = of_pair("finder", state.config, found.hypotheses, measured)
-    if searched or blocked(judged, (convergence, consistency)) is not None:
+    found = settled(Posterior(PAIR, known.belief.pair), measured)
+    judged = None if searched else of_pair(user, known.config, found.hypotheses, measured)
+    if blocked(judged, (convergence, consistency)) is not None:
         found = settled(search(measured, found), measured)
-        judged = of_pair("finder", state.config, found.hypotheses, measured)
+        judged = of_pair(user, known.config, found.hypotheses, measured)
     return found.hypotheses, judged
 
 
@@ -157,8 +164,5 @@ def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
     long way was 0.3 m off, with a sigma of 0.02 m.
     """
     met = replace(met, tick=now.tick, odometry=now.odometry, log=now.log)
-    measured = inference.pair_of(met)
-    known = settled(Posterior(PAIR, met.belief.pair), measured)
-    found = settled(search(measured, known), measured)
-    claimed = claim(of_pair("meeting", met.config, found.hypotheses, measured))
+    claimed = claim(_estimated("meeting", met, inference.pair_of(met), searched=True)[1])
     return claimed if isinstance(claimed, Localised) else None
