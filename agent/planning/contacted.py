@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
-from agent.estimation.gaussian.contact_fit import ContactEstimate, ContactRanges, estimated
+from agent.estimation.gaussian.contact_fit import ContactEstimate, contact_measurements, estimated
 from agent.estimation.gaussian.inference import path_of
 from agent.peer.motion_log import MotionLog
 from agent.planning import sweep
@@ -157,21 +157,21 @@ def _estimated(state: RobotState, found: Contacted) -> tuple[Contacted, Localise
         why = f"{finder.robot} knows its position to {sigma:.3g} m, required {mission.accuracy:g}"
         return replace(found, failure=why), None
     ends = finder.reference, min(finder.log.through, state.tick)
-    ranges = tuple(
-        [
-            Ranged(one.tick - finder.reference, one.range)
-            for one in state.other(finder.robot).mutual
-            if ends[0] <= one.tick <= ends[1]
-        ]
-    )
+    ranges = [
+        (one.tick - finder.reference, one.range)
+        for one in state.other(finder.robot).mutual
+        if ends[0] <= one.tick <= ends[1]
+    ]
     if (
         len(ranges) < max(FEWEST_FOR_POSE, found.ranges_at_estimate + EACH)
         or state.tick < found.estimated_tick + EACH
     ):
         return found, None
     own = MotionLog(state.tick, state.log.between(finder.reference, state.tick))
-    there, here = (path_of(log, 0, log.through, mission) for log in (finder.log, own))
-    estimate = estimated(ContactRanges(finder.pose, finder.covariance, there, here, ranges), mission)
+    paths = path_of(finder.log, 0, finder.log.through, mission), path_of(own, 0, own.through, mission)
+    estimate = estimated(
+        contact_measurements(finder.pose, finder.covariance, paths, ranges, mission), mission
+    )
     found = replace(found, fit=estimate, estimated_tick=state.tick, ranges_at_estimate=len(ranges))
     if estimate is None:
         return replace(found, failure=f"no pose explains the ranges to {finder.robot}"), None

@@ -20,13 +20,12 @@ from agent.estimation.fit import TO_THE_END
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
 from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.inference import covariance_of
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, PosePrior
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, PosePrior
+from agent.estimation.gaussian.measured_rows import Listed, near_anchors
 from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.gaussian.search import extended
 from agent.estimation.judged import of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, follow
-from protocol.messages import Ranged
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, wrap
 
@@ -35,21 +34,6 @@ FINDER, OWN = 0, 1
 
 SAME_LEVEL = 0.05
 """The relative change of the noise level below which a fit is not repeated with it."""
-
-
-class ContactRanges(NamedTuple):
-    """The measurements of a robot without an anchor and of its finder; tick 0 is the reference."""
-
-    pose: Pose
-    """The pose of the finder at the reference tick, as it has estimated it."""
-    covariance: Covariance
-    """The covariance of the error of `pose`."""
-    finder: Track
-    """The odometry of the finder, as far as it is known."""
-    own: Track
-    """The odometry of this robot up to now."""
-    ranges: tuple[Ranged, ...]
-    """The ranges between the two at ticks that both paths have."""
 
 
 class ContactEstimate(NamedTuple):
@@ -65,17 +49,34 @@ class ContactEstimate(NamedTuple):
     """The p-value of the consistency test of the most probable pose."""
 
 
-def estimated(contact: ContactRanges, mission: Mission) -> ContactEstimate | None:
+def contact_measurements(
+    pose: Pose, covariance: Covariance, paths: tuple[Track, Track], ranges: Listed, mission: Mission
+) -> JointMeasurements:
+    """Return the measurements of a finder and of a robot without an anchor; tick 0 is the reference.
+
+    The finder has estimated its `pose` there, with this `covariance`; positions are relative to it. `paths`
+    are the odometry of both, as far as this robot knows it, and `ranges` those between the two.
+    """
+    mean, information = np.zeros((2, 3)), np.zeros((6, 6))
+    mean[FINDER, 2], information[:3, :3] = pose.heading, inverted(np.array(covariance.matrix))
+    reach = mission.sensing_range
+    measured = near_anchors(paths, ((), ()), ((0.0, 0.0), (0.0, 0.0)), mission.noise, reach, ranges)
+    prior = PosePrior(mean, information, 3)
+    return replace(measured, origin=(pose.x, pose.y), prior=prior).thinned(reach)
+
+
+def estimated(measured: JointMeasurements, mission: Mission) -> ContactEstimate | None:
     """Return the possible poses of this robot; None if there are too few ranges, or no pose explains them."""
-    measured = _measured(contact, mission)
     if len(measured.ranges.rho) < FEWEST_FOR_POSE:
         return None
     found = extended(NO_HYPOTHESES, measured)
     if OWN not in found.located:
         return None
     level = found.hypotheses[0].fit.level
-    if abs(level - 1.0) > SAME_LEVEL:  # the level is that of these measurements, not of the finder's pose
-        measured = _with_level(measured, level)
+    if abs(level - 1.0) > SAME_LEVEL:  # the prior in units of the level, which is not that of its covariance
+        prior = measured.prior
+        assert prior is not None
+        measured = replace(measured, prior=prior._replace(information=level * prior.information))
         found = follow(found, measured, TO_THE_END)
     estimate = _estimate(found, measured, mission) if found.hypotheses else None
     return estimate if estimate is not None and _is_sendable(estimate) else None
@@ -92,43 +93,6 @@ def _is_sendable(estimate: ContactEstimate) -> bool:
     except msgspec.ValidationError:
         return False
     return True
-
-
-def _measured(contact: ContactRanges, mission: Mission) -> JointMeasurements:
-    """Return the measurements for a joint fit, relative to the finder's position at the reference tick."""
-    noise, ranges = mission.noise, contact.ranges
-    count = len(ranges)
-    information = np.zeros((6, 6))
-    information[:3, :3] = inverted(np.array(contact.covariance.matrix))
-    mean = np.zeros((2, 3))
-    mean[FINDER, 2] = contact.pose.heading
-    measured = JointMeasurements(
-        ("finder", "own"),
-        (),
-        (("finder", "own"),),
-        (contact.finder, contact.own),
-        JointRanges(
-            np.array([one.range for one in ranges], np.float64),
-            np.array([one.tick for one in ranges], np.intp),
-            np.full(count, max(noise.mutual_sigma, SIGMA_FLOOR)),
-            np.zeros(count, np.intp),
-            np.ones(count, np.intp),
-            np.zeros((count, 2)),
-            np.zeros(count, np.intp),
-        ),
-        mission.period,
-        (contact.pose.x, contact.pose.y),
-        noise,
-        PosePrior(mean, information, 3),
-    )
-    return measured.thinned(mission.sensing_range)
-
-
-def _with_level(measured: JointMeasurements, level: float) -> JointMeasurements:
-    """Return `measured` with the prior in units of the noise level, by which the result is multiplied."""
-    prior = measured.prior
-    assert prior is not None
-    return replace(measured, prior=prior._replace(information=level * prior.information))
 
 
 def _estimate(found: Posterior, measured: JointMeasurements, mission: Mission) -> ContactEstimate:
