@@ -69,6 +69,9 @@ class Priors(NamedTuple):
         return self.wheel_scale > 0.0 or self.gyro_bias > 0.0
 
 
+SIZES = tuple([name for name in Priors._fields if name != "slow_time"])
+"""The fields of Priors, and of Noise, that are sizes of errors: 0 stands for none."""
+
 UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.0, 0.0)
 """The priors of whoever tells none, for ranges with a sigma of UNTOLD_SIGMA or more.
 
@@ -154,36 +157,16 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     @cached_property
     def priors(self) -> Priors:
         """The priors, with those of UNTOLD for those that were not told."""
-        share = self.untold_share
-        return Priors(
-            share * UNTOLD.range_bias if self.range_bias is None else self.range_bias,
-            share * UNTOLD.pair_bias if self.pair_bias is None else self.pair_bias,
-            share * UNTOLD.range_scale if self.range_scale is None else self.range_scale,
-            self.slow_sigma,
-            self.slow_time,
-            share * UNTOLD.wheel_scale if self.wheel_scale is None else self.wheel_scale,
-            share * UNTOLD.gyro_bias if self.gyro_bias is None else self.gyro_bias,
-            self.survey_error,
-            self.range_delay,
+        share, told = self.untold_share, [getattr(self, name) for name in Priors._fields]
+        return Priors._make(
+            [share * untold if one is None else one for one, untold in zip(told, UNTOLD, strict=True)]
         )
 
     @cached_property
     def as_told(self) -> Noise:
         """This noise without any prior: the sigmas are exact, and there are no further errors."""
-        return msgspec.structs.replace(
-            self,
-            range_bias=0.0,
-            pair_bias=0.0,
-            range_scale=0.0,
-            slow_sigma=0.0,
-            wheel_scale=0.0,
-            gyro_bias=0.0,
-            survey_error=0.0,
-            range_delay=0.0,
-            sigma_degrees=0.0,
-            strays=0.0,
-            odometry_strays=0.0,
-        )
+        told = (*SIZES, "sigma_degrees", "strays", "odometry_strays")
+        return msgspec.structs.replace(self, **dict.fromkeys(told, 0.0))
 
     @cached_property
     def standstill_bound(self) -> tuple[float, float]:

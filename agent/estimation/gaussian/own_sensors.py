@@ -19,7 +19,7 @@ from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_tes
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import rescaled
 from agent.estimation.gaussian.search import search, starts_about
-from protocol.noise import PROFILES, UNTOLD_SIGMA, Noise, ProfileName
+from protocol.noise import PROFILES, SIZES, UNTOLD_SIGMA, Noise, ProfileName
 
 DOUBTED_EVIDENCE = 3.0
 """The log evidence for another profile from which on a robot doubts what it was told of its own sensors.
@@ -160,23 +160,10 @@ def _share(noise: Noise) -> float:
     return min(1.0, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA) ** 2
 
 
-SHRINKING = (
-    "range_bias",
-    "pair_bias",
-    "range_scale",
-    "slow_sigma",
-    "wheel_scale",
-    "gyro_bias",
-    "survey_error",
-    "range_delay",
-)
-"""The priors of a profile that are smaller for more accurate ranges."""
-
-
 def _profile(name: ProfileName, noise: Noise, share: float = 1.0) -> Noise:
-    """Return `noise` with the priors of a profile, times `share`, and with its own white noise."""
+    """Return `noise` with the priors of a profile, whose sizes are times `share`, and its own white noise."""
     priors = msgspec.convert(PROFILES[name], Noise).priors._asdict()
-    other = msgspec.convert({**PROFILES[name], **{one: share * priors[one] for one in SHRINKING}}, Noise)
+    other = msgspec.convert({**PROFILES[name], **{one: share * priors[one] for one in SIZES}}, Noise)
     return replace(
         other,
         anchor_sigma=noise.anchor_sigma,
