@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from agent.planning.planner import Planner
+from agent.planning.planner import Planner, Summary
 from agent.process.agent_journal import FramedReport
 from agent.process.report_bodies import body_of, report_of
 from protocol.journal import environment
@@ -177,21 +177,17 @@ class Robot:
         The arguments count the frames that the transport refused and the reports that no Observation listed.
         """
         summary = self.planner.summary(self.state)
+        stated = {name: getattr(summary, name) for name in Summary.__struct_fields__}
+        for name, counted in (
+            ("anchor_ranges", self.anchor_ranges),
+            ("mutual_ranges", self.mutual_ranges),
+            ("reports_heard", self.reports_received),
+        ):
+            stated[name] = counted if stated[name] is None else stated[name]
         final_report = FinalReport(
+            **stated,
             robot=self.config.robot,
-            anchor_ranges=_first(summary.anchor_ranges, self.anchor_ranges),
-            mutual_ranges=_first(summary.mutual_ranges, self.mutual_ranges),
-            branch=summary.branch,
-            alpha=summary.alpha,
-            candidates=summary.candidates,
-            last_turn_rate=summary.last_turn_rate,
-            separation_m2=summary.separation_m2,
-            hypotheses=summary.hypotheses,
-            probability=summary.probability,
-            blocking_reason=summary.blocking_reason,
-            p_value=summary.p_value,
             reports_sent=self.reports_sent,
-            reports_heard=_first(summary.reports_heard, self.reports_received),
             reports_refused=reports_refused + self.damaged,
             reports_unheard=reports_unheard,
             reports_lost=len(self.lost),
@@ -202,8 +198,3 @@ class Robot:
         if self._journal is not None:
             self._journal.write(self._encode(end), self._encode(final_report))
         return final_report
-
-
-def _first(stated: int | None, counted: int) -> int:
-    """Return the number that the planner states; if it states none, the one that was counted."""
-    return counted if stated is None else stated
