@@ -35,7 +35,7 @@ def judged() -> Judged:
 
 def with_p_value(one: Judged, p_value: float) -> Judged:
     assert one.inconsistency is not None
-    return one._replace(inconsistency=one.inconsistency._replace(p_value=p_value), ranges=15)
+    return one._replace(inconsistency=replace(one.inconsistency, p_value=p_value), ranges=15)
 
 
 def with_strays(one: Judged) -> Judged:

@@ -116,7 +116,7 @@ def consistency(judged: Judged) -> str:
     """The residuals agree with the noise: the p-value of the test is at least {CLAIM_P_VALUE:g}."""
     found = judged.inconsistency
     assert found is not None
-    return "" if found.p_value >= CLAIM_P_VALUE else f"the fit fails the consistency test: {found.what}"
+    return "" if found.p_value >= CLAIM_P_VALUE else f"the fit fails the consistency test: {found.claim}"
 
 
 @condition("unanchored", "recording", "team")
@@ -189,7 +189,7 @@ def early_consistency(judged: Judged) -> str:
     assert found is not None
     if judged.ranges >= EARLY_RANGES or found.p_value >= EARLY_CLAIM_P_VALUE:
         return ""
-    return f"the fit is too improbable for so few ranges: {found.what}"
+    return f"the fit is too improbable for so few ranges: {found.claim}"
 
 
 @condition("recording", "team", last=True)

@@ -7,7 +7,7 @@ from typing import Literal, NamedTuple, get_args
 
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
-from agent.estimation.gaussian.consistency import HIGHEST_LEVEL, Inconsistency, chi2_p_value, consistency_test
+from agent.estimation.gaussian.consistency import HIGHEST_LEVEL, chi2_p_value, consistency_test
 from agent.estimation.gaussian.inference import (
     PlanningHypothesis,
     localised,
@@ -18,7 +18,7 @@ from agent.estimation.gaussian.inference import (
 from agent.estimation.gaussian.joint_claims import Displacement, decisive_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.posterior import Certainty, Hypothesis, Posterior
-from protocol.messages import Localised, RobotConfig
+from protocol.messages import Inconsistent, Localised, RobotConfig
 from protocol.mission import HEADING_ACCURACY
 from protocol.noise import Noise
 
@@ -91,7 +91,7 @@ class Judged(NamedTuple):
     """The number of them that the claim needs."""
     stated: PlanningHypothesis
     """The poses of all robots, with the covariance of the claim and the probability of the robot's pose."""
-    inconsistency: Inconsistency | None
+    inconsistency: Inconsistent | None
     """The consistency test of the fit; None if there are too few ranges."""
     accuracy: float
     """The largest sigma (m) of a position."""
@@ -150,9 +150,9 @@ def of_pair(
     )
 
 
-def misfit(fit: Fit) -> Inconsistency:
+def misfit(fit: Fit) -> Inconsistent:
     """Return the test of the residuals of a fit, which is that of all its robots."""
-    return Inconsistency(
+    return Inconsistent(
         f"chi-square {fit.chi2:.3g} for {fit.freedom} degrees of freedom",
         0.0,
         chi2_p_value(fit.chi2 / min(max(fit.level, 1.0), HIGHEST_LEVEL), fit.freedom),

@@ -8,13 +8,12 @@ import msgspec
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import Branch, PairObservation
-from agent.estimation.gaussian.consistency import Inconsistency
 from agent.estimation.posterior import Hypothesis
 from agent.estimation.solver import Solver
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from protocol import messages
-from protocol.messages import Ranged, RobotConfig
+from protocol.messages import Inconsistent, Ranged, RobotConfig
 from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse
 from protocol.orbits import Orbit
 
@@ -68,7 +67,7 @@ class Belief(msgspec.Struct, frozen=True):
     """Noisy sensors: the tick from which on the measurements of a count in `pair` (`inference.beginning`)."""
     ranges_at_last_search: int = 0
     """Noisy sensors: the number of mutual ranges at the latest search of the whole plane for hypotheses."""
-    inconsistency: Inconsistency | None = None
+    inconsistency: Inconsistent | None = None
     """Noisy sensors: the result of the consistency test of the most probable hypothesis."""
     p_value: float | None = None
     """Noisy sensors: the smallest p-value of all searches of the whole plane, and of the claim."""

@@ -107,7 +107,7 @@ def with_consistency_test(state: RobotState) -> RobotState:
     if inconsistent_searches < INCONSISTENT_SEARCHES:
         return state
     doubt = inference.sensor_doubt(state)
-    return state.inconsistent(inconsistency.verdict) if doubt is None else state.undecided(doubt.reason())
+    return state.inconsistent(inconsistency) if doubt is None else state.undecided(doubt.reason())
 
 
 def _least_p_value(belief: Belief) -> float | None:

@@ -103,11 +103,7 @@ def last_manoeuvre(question: Question, mission: Mission, manoeuvres: Manoeuvres)
     safety distance.
     """
     reach, gap, value = compared(question, mission, manoeuvres)
-    row, column = _best(value)
-    if value[row, column] == -np.inf:
-        return None
-    command = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
-    return Plan(command, float(gap[row, column]) if len(question.candidates) > 1 else None, question)
+    return _plan(question, reach, value, gap if len(question.candidates) > 1 else None)
 
 
 def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Compared:
@@ -167,10 +163,7 @@ def most_informative_manoeuvre(
     value = np.where(apart <= mission.sensing_range - RANGE_MARGIN, value, -np.inf)
     if mission.safety_distance:
         value = np.where(_keeps_apart(question, reach, mission), value, -np.inf)
-    row, column = _best(value)
-    if value[row, column] == -np.inf:
-        return None
-    return Plan(Controls(float(reach.v[row, 0]), float(reach.omega[column])), None, question)
+    return _plan(question, reach, value)
 
 
 def _keeps_apart(question: Question, reach: ReachableEnds, mission: Mission) -> NDArray[np.bool]:
@@ -190,6 +183,15 @@ def _standing_position(mover: Role, a: Pose, b: Pose, placement: Placement) -> t
     """Return the position of the robot that does not move, in the frame of the mover's anchor."""
     there = placement.place(a) if mover == "b" else relative(placement.frame, b)
     return there.x, there.y
+
+
+def _plan(question: Question, reach: ReachableEnds, value: Array, gap: Array | None = None) -> Plan | None:
+    """Return the manoeuvre in `reach` with the largest `value`, and its `gap`; None if none is allowed."""
+    row, column = _best(value)
+    if value[row, column] == -np.inf:
+        return None
+    command = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
+    return Plan(command, None if gap is None else float(gap[row, column]), question)
 
 
 def _best(value: Array) -> tuple[int, int]:

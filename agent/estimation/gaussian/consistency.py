@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
 
 import numpy as np
+from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation.fit import Fit
@@ -70,20 +70,7 @@ def rejecting_p_value(noise: Noise) -> float:
     return float(INCONSISTENT_P_VALUE ** (1.0 - share) * INCONSISTENT_P_VALUE_UNTOLD**share)
 
 
-class Inconsistency(NamedTuple):
-    """The least favourable test of a fit: a description, its sigmas and its p-value."""
-
-    what: str
-    sigmas: float
-    p_value: float
-
-    @property
-    def verdict(self) -> Inconsistent:
-        """Return the verdict on the peer for this result."""
-        return Inconsistent(self.what, self.sigmas, self.p_value)
-
-
-def consistency_test(fitted: Fit, pair: JointMeasurements, robot: int) -> Inconsistency:
+def consistency_test(fitted: Fit, pair: JointMeasurements, robot: int) -> Inconsistent:
     """Return the least probable of three tests: all residuals, the strays, and the distance of the anchors.
 
     Its p-value is that of the three together if that is smaller: false data may be a little improbable in
@@ -102,22 +89,22 @@ def consistency_test(fitted: Fit, pair: JointMeasurements, robot: int) -> Incons
     if learned or fitted.inliers < count:  # the own ranges, without the peer's reports
         own = own_fit(fitted, robot, pair)
         if own is None:
-            return Inconsistency("ranges to one anchor that no motion explains", 0.0, 0.0)
+            return Inconsistent("ranges to one anchor that no motion explains", 0.0, 0.0)
     if learned and own is not None:
         p_value, misfit = _against_own(fitted, own, pair.noise)
     what = (
         "measurements and reports that contradict each other: "
         f"chi-square {fitted.chi2:.3g} for {free} degrees of freedom"
     )
-    tests = [Inconsistency(what, max(misfit, 0.0), p_value)]
+    tests = [Inconsistent(what, max(misfit, 0.0), p_value)]
     if own is not None and fitted.inliers < count:
         tests.append(_strays_test(fitted, own, pair, robot))
     if fitted.last_step <= FINISHED:
         score = abs(_distance_score(fitted, pair))
         what = "motion that implies another distance between the anchors"
-        tests.append(Inconsistency(what, score, math.erfc(score / math.sqrt(2.0))))
+        tests.append(Inconsistent(what, score, math.erfc(score / math.sqrt(2.0))))
     least = min(tests, key=lambda one: one.p_value)
-    return least._replace(p_value=min(least.p_value, fisher([one.p_value for one in tests])))
+    return replace(least, p_value=min(least.p_value, fisher([one.p_value for one in tests])))
 
 
 def fisher(p_values: Sequence[float]) -> float:
@@ -148,7 +135,7 @@ LEARNED_P_VALUE = 1e-2
 """The p-value under the told noise below which a robot asks how noisy its own ranges are."""
 
 
-def _strays_test(fitted: Fit, own: Fit, pair: JointMeasurements, robot: int) -> Inconsistency:
+def _strays_test(fitted: Fit, own: Fit, pair: JointMeasurements, robot: int) -> Inconsistent:
     """Return the test of the number of strays among the ranges that depend on the peer.
 
     The rate of strays follows from the ranges to the own anchor and from what was told. The peer's ranges
@@ -170,7 +157,7 @@ def _strays_test(fitted: Fit, own: Fit, pair: JointMeasurements, robot: int) -> 
     p_value, count, total = min((beta_binomial_tail(k, n, strays, ranges), k, n) for k, n in tested)
     p_value = min(p_value * max(tested[0][0], 1), 1.0)
     what = f"measurements and reports of which {count} of {total} fit no other"
-    return Inconsistency(what, sigmas(p_value), p_value)
+    return Inconsistent(what, sigmas(p_value), p_value)
 
 
 def _from_either_end(stray: NDArray[np.bool]) -> list[tuple[int, int]]:

@@ -16,7 +16,6 @@ from msgspec.structs import replace
 from agent.estimation.elementary import product
 from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit, deviation
-from agent.estimation.gaussian.consistency import Inconsistency
 from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, Silence
 from agent.estimation.gaussian.measured_rows import Listed, near_anchors
@@ -28,7 +27,7 @@ from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.estimation.posterior import Hypothesis
 from agent.peer.motion_log import MotionLog
-from protocol.messages import Localised, RobotConfig
+from protocol.messages import Inconsistent, Localised, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import Covariance, Pose, Segment, compose, inverse, relative, wrap
 from protocol.noise import VelocityNoise
@@ -322,7 +321,7 @@ def _pair_planning_hypothesis(probability: float, one: Fit) -> PlanningHypothesi
 def with_pair(
     knowledge: Knowledge,
     scored: Sequence[Hypothesis],
-    inconsistency: Inconsistency | None,
+    inconsistency: Inconsistent | None,
     blocking_reason: str | None,
 ) -> Belief:
     """Return the belief with the hypotheses `scored` about both robots' poses in <W>.
