@@ -39,7 +39,7 @@ from __future__ import annotations
 import math
 import re
 from functools import cached_property
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal, TypeVar
 
 import msgspec
 from msgspec import Meta
@@ -62,6 +62,8 @@ from protocol.units import (
     Time,
     Velocity,
 )
+
+T = TypeVar("T")
 
 Outcome = Literal["localised", "undecided", "inconsistent", "wrong", "failed"]
 """The outcome of a run. Only `localised` is a success.
@@ -346,6 +348,45 @@ class Pairing(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_field
     """The orbits of both robots in phase 2."""
 
 
+class OfPair:
+    """The anchor and the meeting of a robot, whose name is its first field. In a team, it has neither."""
+
+    __slots__ = ()
+    __struct_fields__: ClassVar[tuple[str, ...]]
+    given_anchor: Anchor | None
+    encounter: Pairing | None
+
+    def _known(self, value: T | None, what: str) -> T:
+        if value is None:
+            raise LookupError(f"{getattr(self, self.__struct_fields__[0])} has no {what}")
+        return value
+
+    @property
+    def anchor(self) -> Anchor:
+        """The position of the robot's own anchor in <W>, in m. Raises LookupError if it has none."""
+        return self._known(self.given_anchor, "anchor")
+
+    @property
+    def meeting(self) -> Pairing:
+        """The robot that it has to meet. Raises LookupError if there is none."""
+        return self._known(self.encounter, "peer")
+
+    @property
+    def peer(self) -> RobotId:
+        """The robot that it has to meet."""
+        return self.meeting.peer
+
+    @property
+    def role(self) -> Role:
+        """The role of this robot in the pair."""
+        return self.meeting.role
+
+    @property
+    def rendezvous(self) -> Rendezvous:
+        """The orbits of both robots in phase 2."""
+        return self.meeting.rendezvous
+
+
 class TeamAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """An anchor of a team, as its robots know it."""
 
@@ -376,7 +417,7 @@ class Team(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=T
     has found them; 0: ranges connect all robots."""
 
 
-class RobotConfig(Message, frozen=True, dict=True):
+class RobotConfig(OfPair, Message, frozen=True, dict=True):
     """The configuration of a robot: everything that its agent needs to start.
 
     It has either an `encounter`, in a pair or a group, or a `team`.
@@ -438,38 +479,9 @@ class RobotConfig(Message, frozen=True, dict=True):
             raise ValueError("unanchored: such robots need members, and a sweep that finds them")
 
     @property
-    def anchor(self) -> Anchor:
-        """The position of the robot's own anchor in <W>, in m. Raises LookupError if it has none."""
-        if self.given_anchor is None:
-            raise LookupError(f"{self.robot} has no anchor")
-        return self.given_anchor
-
-    @property
-    def meeting(self) -> Pairing:
-        """The robot that it has to meet. Raises LookupError if there is none."""
-        if self.encounter is None:
-            raise LookupError(f"{self.robot} has no peer")
-        return self.encounter
-
-    @property
-    def peer(self) -> RobotId:
-        """The robot that it has to meet."""
-        return self.meeting.peer
-
-    @property
-    def role(self) -> Role:
-        """The role of this robot in the pair."""
-        return self.meeting.role
-
-    @property
     def peer_anchor(self) -> Anchor:
         """The position of the peer's anchor in <W>, in m."""
         return self.meeting.peer_anchor
-
-    @property
-    def rendezvous(self) -> Rendezvous:
-        """The orbits of both robots in phase 2."""
-        return self.meeting.rendezvous
 
     @property
     def m1(self) -> Anchor:

@@ -12,10 +12,18 @@ import msgspec
 from msgspec import Meta
 
 from protocol.attack import Attack
-from protocol.messages import MAX_MEMBERS, Appointment, Member, Pairing, RobotConfig, Team, TeamAnchor
-from protocol.mission import Anchor, Mission, Options, PlannerName, Role
+from protocol.messages import (
+    MAX_MEMBERS,
+    Appointment,
+    Member,
+    OfPair,
+    Pairing,
+    RobotConfig,
+    Team,
+    TeamAnchor,
+)
+from protocol.mission import Anchor, Mission, Options, PlannerName
 from protocol.motion import Pose
-from protocol.orbits import Rendezvous
 from protocol.sweep_strips import SweptArea
 from protocol.units import Clearance, RobotId, Tick, Time
 from world.faults import Fault
@@ -34,7 +42,7 @@ def model_class(name: str, shipped: Mapping[str, Any]) -> Any:
     return model
 
 
-class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class RobotSpec(OfPair, msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The specification of one robot."""
 
     id: RobotId
@@ -49,35 +57,6 @@ class RobotSpec(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fie
     """The false data that the robot injects into its Reports; None for an honest robot."""
     ranges: tuple[RobotId, ...] = ()
     """The anchors of a team that it may range."""
-
-    @property
-    def meeting(self) -> Pairing:
-        """The robot that it has to meet. Raises LookupError if there is none."""
-        if self.encounter is None:
-            raise LookupError(f"{self.id} has no peer")
-        return self.encounter
-
-    @property
-    def peer(self) -> RobotId:
-        """The robot that it has to meet."""
-        return self.meeting.peer
-
-    @property
-    def role(self) -> Role:
-        """The role of the robot in the pair."""
-        return self.meeting.role
-
-    @property
-    def rendezvous(self) -> Rendezvous:
-        """The orbits of the pair."""
-        return self.meeting.rendezvous
-
-    @property
-    def anchor(self) -> Anchor:
-        """The position of its anchor in <W>, in m. Raises LookupError if it has none."""
-        if self.given_anchor is None:
-            raise LookupError(f"{self.id} has no anchor")
-        return self.given_anchor
 
 
 GIVES_UP = 0.97
