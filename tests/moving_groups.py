@@ -1,4 +1,7 @@
-"""Facts of simulated groups for tests: robots that move, with noise, ranges to anchors and to each other."""
+"""Facts of simulated groups for tests: robots that move, with noise, ranges to anchors and to each other.
+
+A fact is known by its robot, its tick and its kind, and those of a list are in any order.
+"""
 
 from __future__ import annotations
 
@@ -9,15 +12,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.facts import (
-    Fact,
-    Facts,
-    Manoeuvre,
-    anchor,
-    anchor_range,
-    manoeuvre,
-    mutual_range,
-)
+from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRange, MeasuredRow, StartPose
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.measured_rows import of_rows
 from agent.estimation.gaussian.odometry_noise import STRAY_DISTANCE, STRAY_TURN, track
 from protocol.motion import Pose, step
 from protocol.noise import Noise, VelocityNoise
@@ -33,10 +30,79 @@ NOISE = Noise(
 )
 
 
+class FactKey(NamedTuple):
+    """The key of a fact."""
+
+    robot: str
+    """The robot, or the anchor of the kind `anchor`. Of a mutual range, the smaller of the two names."""
+    tick: int
+    kind: str
+    other: str = ""
+    """The other robot of a mutual range, or the anchor of an anchor range."""
+
+
+class Fact(NamedTuple):
+    """A key with its value."""
+
+    key: FactKey
+    value: Manoeuvre | MeasuredRange | AnchorPlace | StartPose
+
+
+def anchor(name: str, x: float, y: float, sigma: float = 0.0) -> Fact:
+    """Return the fact that an anchor is at x, y (m), with a `sigma` (m); infinite: it is not known where."""
+    unknown = sigma == math.inf
+    return Fact(FactKey(name, 0, "anchor"), AnchorPlace(0.0 if unknown else x, 0.0 if unknown else y, sigma))
+
+
+def anchor_range(robot: str, name: str, tick: int, rho: float, sigma: float) -> Fact:
+    """Return the range `rho` (m) of `robot` to an anchor."""
+    return Fact(FactKey(robot, tick, "anchor range", name), MeasuredRange(rho, sigma))
+
+
+def mutual_range(robot: str, other: str, tick: int, rho: float, sigma: float) -> Fact:
+    """Return the range `rho` (m) between two robots, in either order."""
+    first, second = sorted((robot, other))
+    return Fact(FactKey(first, tick, "mutual range", second), MeasuredRange(rho, sigma))
+
+
+def manoeuvre(robot: str, tick: int, measured: Manoeuvre) -> Fact:
+    """Return the motion that `robot` has `measured` from `tick` to the next."""
+    return Fact(FactKey(robot, tick, "manoeuvre"), measured)
+
+
+def start_pose(robot: str, x: float, y: float, heading: float) -> Fact:
+    """Return the pose of `robot` at tick 0, in m and rad."""
+    return Fact(FactKey(robot, 0, "start"), StartPose(x, y, heading))
+
+
+def joint_measurements(
+    facts: Sequence[Fact], noise: Noise, period: float, reach: float = math.inf
+) -> JointMeasurements:
+    """Return the measurements in `facts`. The path of a robot reaches to its first unknown manoeuvre."""
+    places = {key.robot: value for key, value in facts if isinstance(value, AnchorPlace)}
+    starts = {key.robot: value for key, value in facts if isinstance(value, StartPose)}
+    steps: dict[str, list[Manoeuvre]] = {name: [] for name in robots_of(facts)}
+    for key, value in sorted(facts, key=lambda one: one.key):
+        if isinstance(value, Manoeuvre) and key.tick == len(steps[key.robot]):
+            steps[key.robot].append(value)
+    rows = [
+        MeasuredRow(key.kind == "mutual range", key.robot, key.other, key.tick, value)
+        for key, value in facts
+        if isinstance(value, MeasuredRange)
+    ]
+    return of_rows(places, starts, steps, rows, noise, period, reach)
+
+
+def robots_of(facts: Sequence[Fact]) -> list[str]:
+    """Return the names of all robots with a manoeuvre, a range or a start, in their order."""
+    names = {key.robot for key, _ in facts if key.kind != "anchor"}
+    return sorted(names | {key.other for key, _ in facts if key.kind == "mutual range"})
+
+
 class MovingGroup(NamedTuple):
     """The facts of a group, and the truth."""
 
-    facts: Facts
+    facts: list[Fact]
     noise: Noise
     starts: Array
     """The true pose of each robot at tick 0; shape (n, 3)."""
@@ -46,6 +112,16 @@ class MovingGroup(NamedTuple):
     """The true x and y of each robot at each tick; shape (n, 2, k + 1)."""
     delay: float
     """The delay of all ranges in s."""
+
+    @property
+    def robots(self) -> list[str]:
+        """The names of the robots."""
+        return robots_of(self.facts)
+
+    @property
+    def anchors(self) -> list[Fact]:
+        """The places of the anchors, in the order of their names."""
+        return sorted([one for one in self.facts if one.key.kind == "anchor"])
 
 
 def moving_group(
@@ -125,4 +201,4 @@ def moving_group(
                 apart = float(np.hypot(*(late[i][:, tick] - late[j][:, tick])))
                 rho = measured((names[i], names[j]), apart)
                 known.append(mutual_range(names[i], names[j], tick, rho, noise.mutual_sigma))
-    return MovingGroup(Facts(frozenset(known)), noise, starts, ends, paths, delay)
+    return MovingGroup(sorted(known, key=lambda one: one.key), noise, starts, ends, paths, delay)

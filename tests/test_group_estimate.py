@@ -38,11 +38,11 @@ def recorded(robots: int, seed: int, *, unanchored: tuple[int, ...] = (), alone:
     Of the true poses, the headings are those of the odometry.
     """
     group = moving_group(robots, seed, unanchored=unanchored)
-    names = [*group.facts.robots, *[f"x{i}" for i in range(alone)]]
+    names = [*group.robots, *[f"x{i}" for i in range(alone)]]
     found = []
     for name in names:
-        own = name if name in group.facts.robots else "r00"
-        steps = [value for key, value in group.facts.of_kind("manoeuvre") if key.robot == own]
+        own = name if name in group.robots else "r00"
+        steps = [value for key, value in group.facts if key.kind == "manoeuvre" and key.robot == own]
         turned = np.concatenate(([0.0], np.cumsum([one[1] for one in steps])))
         moved = np.array([one[0] for one in steps]) * np.exp(1j * (turned[:-1] + 0.5 * np.diff(turned)))
         moved = moved * np.sinc(0.5 * np.diff(turned) / np.pi)
@@ -50,17 +50,17 @@ def recorded(robots: int, seed: int, *, unanchored: tuple[int, ...] = (), alone:
         dead = np.stack((at.real, at.imag, turned), 1)
         t = np.arange(41.0)
         truth = None
-        if name in group.facts.robots:
-            index = group.facts.robots.index(name)
+        if name in group.robots:
+            index = group.robots.index(name)
             truth = TruePath(t, np.column_stack((*group.paths[index], group.starts[index, 2] + turned)))
         odometry = RobotOdometry(t[:-1], t[1:], relative(dead[:-1], dead[1:]), np.full((40, 3, 3), np.nan))
         found.append(RecordedRobot(name, odometry, truth))
-    anchors = [FixedAnchor(key.robot, *value) for key, value in group.facts.of_kind("anchor")]
+    anchors = [FixedAnchor(key.robot, *value) for key, value in group.anchors]
     radios = [*names, *[one.id for one in anchors]]
     rows = sorted(
         [
             (float(key.tick), radios.index(key.robot), radios.index(key.other), value[0])
-            for key, value in group.facts.known
+            for key, value in group.facts
             if key.other
         ]
     )

@@ -14,16 +14,7 @@ from scipy.optimize import least_squares  # type: ignore[import-untyped]
 from scipy.stats import binom, chi2  # type: ignore[import-untyped]
 
 from agent.estimation.claim import BEFORE_SEARCH, blocked
-from agent.estimation.facts import (
-    AnchorPlace,
-    Facts,
-    Manoeuvre,
-    anchor,
-    anchor_range,
-    manoeuvre,
-    mutual_range,
-    start_pose,
-)
+from agent.estimation.facts import AnchorPlace, Manoeuvre
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.joint_claims import (
@@ -33,13 +24,23 @@ from agent.estimation.gaussian.joint_claims import (
     undetermined,
 )
 from agent.estimation.gaussian.joint_ranges import MOST_MUTUAL_RANGES, JointMeasurements
-from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.gaussian.odometry_noise import constant_errors, track, variances
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import of_joint
 from agent.estimation.posterior import Certainty, Posterior, certainties
 from protocol.noise import Noise
-from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
+from tests.moving_groups import (
+    NOISE,
+    PERIOD_S,
+    MovingGroup,
+    anchor,
+    anchor_range,
+    joint_measurements,
+    manoeuvre,
+    moving_group,
+    mutual_range,
+    start_pose,
+)
 
 Array = NDArray[np.float64]
 
@@ -215,17 +216,17 @@ def test_outliers_do_not_move_a_group() -> None:
 
 def pairwise_errors(group: MovingGroup) -> list[float]:
     """Return the error (m) of each robot, estimated together with the next one alone."""
-    names, found = group.facts.robots, []
+    names, found = group.robots, []
     for i, name in enumerate(names):
         j = (i + 1) % len(names)
         two = {name, names[j]}
         some = [
             one
-            for one in group.facts.known
+            for one in group.facts
             if one.key.kind == "anchor"
             or {one.key.robot, one.key.other} - {f"M{each}" for each in two} <= two | {""}
         ]
-        measured = joint_measurements(Facts(frozenset(some)), group.noise, PERIOD_S, REACH)
+        measured = joint_measurements(some, group.noise, PERIOD_S, REACH)
         of_two = search(measured)
         order = sorted((i, j))
         part = group._replace(ends=group.ends[order])
@@ -253,7 +254,7 @@ def with_anchors(
 ) -> tuple[JointMeasurements, dict[str, Array]]:
     """Return the measurements with some anchors told with errors of their sigmas, and their true places."""
     draw, known, true = np.random.default_rng(seed), [], {}
-    for one in group.facts.ordered:
+    for one in group.facts:
         name, value = one.key.robot, one.value
         if isinstance(value, AnchorPlace) and name in sigmas:
             true[name] = np.array((value.x, value.y))
@@ -262,7 +263,7 @@ def with_anchors(
             known.append(anchor(name, x, y, sigmas[name]))
         else:
             known.append(one)
-    return joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH), true
+    return joint_measurements(known, group.noise, PERIOD_S, REACH), true
 
 
 def anchor_errors(fit: Fit, used: JointMeasurements, true: dict[str, Array]) -> tuple[Array, list[float]]:
@@ -314,10 +315,10 @@ def test_an_anchor_that_stands_elsewhere_than_surveyed_is_named(sigma: float) ->
         anchor(one.key.robot, one.value.x + 2.0, one.value.y, sigma)
         if isinstance(one.value, AnchorPlace) and one.key.robot == "Mr02"
         else one
-        for one in group.facts.ordered
+        for one in group.facts
     ]
-    for known, name in ((group.facts.ordered, None), (moved, "Mr02")):
-        measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+    for known, name in ((group.facts, None), (moved, "Mr02")):
+        measured = joint_measurements(known, group.noise, PERIOD_S, REACH)
         found = search(measured)
         displaced = displaced_anchor(displacements(found.hypotheses[0].fit, measured.some(found.located)))
         assert (displaced.anchor if displaced is not None else None) == name
@@ -330,8 +331,7 @@ def relative(robots: int, seed: int, sigma: float) -> tuple[MovingGroup, JointMe
     """Return a group without anchors, of which the start of r00 is known; ranges have the `sigma` (m)."""
     noise = NOISE if sigma == NOISE.mutual_sigma else Noise(sigma, sigma)
     group = moving_group(robots, seed, noise=noise, unanchored=range(robots))
-    told = Facts(frozenset([start_pose("r00", *group.starts[0].tolist())]))
-    group = group._replace(facts=group.facts | told)
+    group = group._replace(facts=[*group.facts, start_pose("r00", *group.starts[0].tolist())])
     return group, measured_of(group)
 
 
@@ -370,7 +370,7 @@ def driven(
         errors = draw.normal(0.0, noise.mutual_sigma, ticks + 1)
         for tick, rho in enumerate(np.abs(np.hypot(*(paths[i] - paths[j])) + errors).tolist()):
             known.append(mutual_range(f"r{i}", f"r{j}", tick, rho, noise.mutual_sigma))
-    measured = joint_measurements(Facts(frozenset(known)), noise, PERIOD_S, REACH)
+    measured = joint_measurements(known, noise, PERIOD_S, REACH)
     return measured, np.array(paths)[:, :, -1]
 
 
@@ -397,11 +397,11 @@ def test_of_two_robots_on_straight_lines_all_four_images_are_found() -> None:
 
 def test_a_robot_without_ranges_to_the_frame_has_no_pose_and_says_why() -> None:
     group, _ = relative(2, 7, 0.05)
-    known = [*group.facts.known, mutual_range("r00", "w", 1, 3.0, 0.05)]
+    known = [*group.facts, mutual_range("r00", "w", 1, 3.0, 0.05)]
     for tick in range(20):
         known += [manoeuvre(name, tick, Manoeuvre(0.2, 0.2)) for name in ("u", "v", "w")]
         known.append(mutual_range("u", "v", tick, 3.0, 0.05))
-    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+    measured = joint_measurements(known, group.noise, PERIOD_S, REACH)
     found = search(measured)
     assert [measured.robots[one] for one in found.located] == ["r00", "r01"]
     u, w = [undetermined(measured.robots.index(name), found.located, measured) for name in "uw"]
@@ -435,14 +435,14 @@ def test_covariances_in_the_frame_of_a_robot_are_right(robots: int, sigma: float
 def ambiguous() -> tuple[JointMeasurements, Posterior]:
     """Return a group in which r02 drives straight, and has ranges to two anchors alone."""
     group = moving_group(2, 7)
-    known = [*group.facts.known, anchor("P", 20.0, 0.0), anchor("Q", 26.0, 0.0)]
+    known = [*group.facts, anchor("P", 20.0, 0.0), anchor("Q", 26.0, 0.0)]
     for tick in range(41):
         x, y = 21.0 + 0.1 * tick, 3.0 + 0.02 * tick
         known.append(manoeuvre("r02", tick, Manoeuvre(math.hypot(0.1, 0.02), 0.0)))
         for name, at in (("P", 20.0), ("Q", 26.0)):
             if tick % 2 == 0:
                 known.append(anchor_range("r02", name, tick, math.hypot(x - at, y), 0.05))
-    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+    measured = joint_measurements(known, group.noise, PERIOD_S, REACH)
     return measured, search(measured)
 
 
@@ -468,21 +468,21 @@ def test_ranges_among_robots_do_not_add_to_those_that_connect_them_with_the_fram
             mutual_range(one, other, tick, 3.0, 0.05) for one, other in (("a", "b"), ("b", "c"), ("a", "c"))
         ]
         known += [mutual_range("o", "a", tick, 2.0, 0.05)] if tick < 3 else []
-    measured = joint_measurements(Facts(frozenset(known)), NOISE, PERIOD_S, REACH)
+    measured = joint_measurements(known, NOISE, PERIOD_S, REACH)
     assert measured.robots == ("a", "b", "c", "o")
     assert [decisive_ranges(robot, measured) for robot in range(4)] == [3, 3, 3, 3]
-    more = Facts(frozenset([*known, *[mutual_range("o", "c", tick, 2.0, 0.05) for tick in range(5)]]))
+    more = [*known, *[mutual_range("o", "c", tick, 2.0, 0.05) for tick in range(5)]]
     measured = joint_measurements(more, NOISE, PERIOD_S, REACH)
     assert [decisive_ranges(robot, measured) for robot in range(4)] == [8, 8, 8, 8]
 
 
 def test_a_component_without_two_anchors_has_no_pose_and_says_why() -> None:
     group = moving_group(2, 7)
-    known = [*group.facts.known, anchor("P", 20.0, 0.0)]
+    known = [*group.facts, anchor("P", 20.0, 0.0)]
     for tick in range(20):
         known += [manoeuvre(name, tick, Manoeuvre(0.2, 0.2)) for name in ("u", "v", "w")]
         known += [mutual_range("u", "v", tick, 3.0, 0.05), anchor_range("u", "P", tick, 2.0, 0.05)]
-    measured = joint_measurements(Facts(frozenset(known)), group.noise, PERIOD_S, REACH)
+    measured = joint_measurements(known, group.noise, PERIOD_S, REACH)
     found = search(measured)
     assert [measured.robots[one] for one in found.located] == ["r00", "r01"]
     u, v, w = [undetermined(measured.robots.index(name), found.located, measured) for name in "uvw"]

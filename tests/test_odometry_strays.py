@@ -10,11 +10,10 @@ from msgspec.structs import replace
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.measured_rows import joint_measurements
 from compose.recording.estimating.noise_files import AssumedNoise
 from protocol.motion import wrap
 from protocol.noise import Noise
-from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, moving_group
+from tests.moving_groups import NOISE, PERIOD_S, MovingGroup, joint_measurements, moving_group
 
 SHARE = 0.05
 

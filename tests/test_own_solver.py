@@ -12,14 +12,13 @@ from msgspec.structs import replace
 
 import tandem
 from agent.estimation.fit import Start, fits
-from agent.estimation.gaussian.measured_rows import joint_measurements
 from compose import scenario
 from compose.errors import PlannerFailed, UserError
 from compose.recording.run import read
 from tests.commands import tandem as command
 from tests.expected.playing import decisions
 from tests.groups import table_of
-from tests.moving_groups import NOISE, PERIOD_S, moving_group
+from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
 from tests.own_solvers import Broken, Exiting, Smoother, WithBroken, WithNoSolver, WithNothing, WithSmoother
 
 SHIPPED = Path(scenario.__file__).parent / "shipped" / "noisy.toml"

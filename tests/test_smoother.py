@@ -14,12 +14,11 @@ from agent.estimation import gauss_newton, smoother
 from agent.estimation.fit import Start, fits
 from agent.estimation.gauss_newton import Convergence, Fitted, Point, moved, point_at
 from agent.estimation.gaussian.joint_ranges import PosePrior
-from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
 from agent.estimation.smoother import Measured, Singular, effect_of
 from protocol.motion import Pose, step
-from tests.moving_groups import NOISE, PERIOD_S, moving_group
+from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
 
 Array = smoother.Array
 

@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 from msgspec.structs import astuple, replace
 
-from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRange, StartPose
+from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRange, MeasuredRow, StartPose
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.measured_rows import MeasuredRow, of_rows
+from agent.estimation.gaussian.measured_rows import of_rows
 from agent.peer.team_log import Entry, TeamLog
 from protocol.messages import Team
 from protocol.mission import Mission

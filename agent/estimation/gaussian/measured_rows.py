@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.facts import AnchorPlace, Facts, Manoeuvre, MeasuredRange, StartPose
+from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRow, StartPose
 from agent.estimation.gaussian.joint_ranges import (
     JointMeasurements,
     JointRanges,
@@ -68,38 +67,6 @@ def near_anchors(
     )
 
 
-class MeasuredRow(NamedTuple):
-    """A range with the names of its radios, in the order of the ranges of a fit."""
-
-    mutual: bool
-    first: str
-    second: str
-    tick: int
-    measured: MeasuredRange
-
-
-def joint_measurements(
-    facts: Facts, noise: Noise, period: float, reach: float = math.inf
-) -> JointMeasurements:
-    """Return the measurements in `facts`, with ticks of `period` s. No range above `reach` m is expected.
-
-    The path of a robot reaches to its first unknown manoeuvre; ranges after it are not used, nor those to
-    anchors of which no position is known.
-    """
-    places = {key.robot: value for key, value in facts.known if isinstance(value, AnchorPlace)}
-    starts = {key.robot: value for key, value in facts.known if isinstance(value, StartPose)}
-    steps: dict[str, list[Manoeuvre]] = {name: [] for name in facts.robots}
-    for key, value in facts.of_kind("manoeuvre"):
-        if isinstance(value, Manoeuvre) and key.tick == len(steps[key.robot]):
-            steps[key.robot].append(value)
-    rows = [
-        MeasuredRow(key.kind == "mutual range", key.robot, key.other, key.tick, value)
-        for key, value in facts.ordered
-        if isinstance(value, MeasuredRange)
-    ]
-    return of_rows(places, starts, steps, rows, noise, period, reach)
-
-
 def of_rows(
     places: Mapping[str, AnchorPlace],
     starts: Mapping[str, StartPose],
@@ -107,11 +74,13 @@ def of_rows(
     measured: Iterable[MeasuredRow],
     noise: Noise,
     period: float,
-    reach: float,
+    reach: float = math.inf,
 ) -> JointMeasurements:
     """Return what was `measured` by robots whose manoeuvres from tick 0 on are in `steps`.
 
-    `places` are those of the anchors, and `starts` those of the robots that have one.
+    `places` are those of the anchors, and `starts` those of the robots that have one. Ticks last `period` s,
+    and no range above `reach` m is expected. Ranges after the path of a robot are not used, nor those to
+    anchors that have no place.
     """
     surveyed, robots = {name: one for name, one in places.items() if not one.sigma}, sorted(steps)
     rows = [

@@ -14,18 +14,9 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.estimation.facts import (
-    Fact,
-    Facts,
-    Manoeuvre,
-    anchor,
-    anchor_range,
-    manoeuvre,
-    mutual_range,
-    start_pose,
-)
+from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRange, MeasuredRow, StartPose
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.measured_rows import joint_measurements
+from agent.estimation.gaussian.measured_rows import of_rows
 from agent.estimation.gaussian.odometry_noise import Track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from compose.errors import BadRecording, NoEstimate, UserError
@@ -233,12 +224,21 @@ def _measurements(
     anchors = [used.anchors_of(i)[:MOST_USED_ANCHORS] for i in range(len(names))]
     ranges = list(_ranges(used, steps, assumed, anchors))
     placed = {one.id: one for own in anchors for one in own}.values()
-    facts = {anchor(one.id, one.x, one.y, one.sigma) for one in placed}
-    for name, increments, covariance in zip(names, steps.increments, steps.covariance, strict=True):
-        facts.update(_manoeuvres(name, increments, covariance, period))
+    places = {
+        one.id: AnchorPlace(0.0, 0.0, one.sigma)
+        if one.sigma == math.inf
+        else AnchorPlace(one.x + 0.0, one.y + 0.0, one.sigma + 0.0)
+        for one in placed
+    }
+    manoeuvres = {
+        name: _manoeuvres(increments, covariance, period)
+        for name, increments, covariance in zip(names, steps.increments, steps.covariance, strict=True)
+    }
+    starts: dict[str, StartPose] = {}
     recorded = tuple(map(with_bridged_truth, whole.robots))
     if relative is not None:
-        facts.add(start_pose(relative, *whole.robot(relative).antenna[:2], 0.0))
+        x, y, _ = whole.robot(relative).antenna
+        starts[relative] = StartPose(x + 0.0, y + 0.0, 0.0)
         recorded = tuple(in_frame_of(relative, t0, recorded))
     unused = {
         f"to others than the {MOST_USED_ANCHORS} anchors with the most": len(steps.ranges.t) - len(ranges),
@@ -247,7 +247,7 @@ def _measurements(
     return Measurements(
         source=part.source,
         robots=tuple(map(MeasuredRobot, recorded, anchors, prepared)),
-        joint=joint_measurements(Facts(frozenset(facts.union(ranges))), noise, period),
+        joint=of_rows(places, starts, manoeuvres, ranges, noise, period),
         t0=t0,
         ticks_per_epoch=ticks,
         noise=assumed.name,
@@ -268,7 +268,7 @@ def ticks_per_epoch(recording: RangeRecording, noise: Noise) -> int:
 
 def _ranges(
     used: RangeRecording, steps: RangeSteps, assumed: AssumedNoise, anchors: list[tuple[FixedAnchor, ...]]
-) -> Iterator[Fact]:
+) -> Iterator[MeasuredRow]:
     """Yield the ranges in the plane between robots and to their `anchors`, each at the nearest tick."""
     ranges, count, noise = steps.ranges, len(used.robots), assumed.noise
     heights = np.array([*[one.antenna[2] for one in used.robots], *[one.height for one in used.anchors]])
@@ -280,16 +280,17 @@ def _ranges(
     ticks = steps.step + (steps.fraction >= 0.5)
     own, radios = [{one.id for one in each} for each in anchors], used.radios
     columns = [each.tolist() for each in (ranges.first, ranges.second, ticks, rho, sigma)]
-    for first, second, *measured in zip(*columns, strict=True):
+    for first, second, tick, distance, spread in zip(*columns, strict=True):
         robot, other = radios[first], radios[second]
+        measured = MeasuredRange(distance + 0.0, spread + 0.0)
         if second < count:
-            yield mutual_range(robot, other, *measured)
+            yield MeasuredRow(True, min(robot, other), max(robot, other), tick, measured)
         elif other in own[first]:
-            yield anchor_range(robot, other, *measured)
+            yield MeasuredRow(False, robot, other, tick, measured)
 
 
-def _manoeuvres(robot: str, increments: Numbers, covariance: Numbers, period: float) -> Iterator[Fact]:
-    """Yield the motion in each step of `period` s, with the variances of the increments.
+def _manoeuvres(increments: Numbers, covariance: Numbers, period: float) -> list[Manoeuvre]:
+    """Return the motion in each step of `period` s, with the variances of the increments.
 
     The error sideways is not used: a path has none but that of its heading.
     """
@@ -305,8 +306,7 @@ def _manoeuvres(robot: str, increments: Numbers, covariance: Numbers, period: fl
     v_variance = np.einsum("ki,kij,kj->k", along, covariance[:, :2, :2], along) / np.square(unit)
     v = np.where(backwards, -moved, moved) / unit
     columns = np.stack((v, turn / period, slip, v_variance, covariance[:, 2, 2] / period**2), 1)
-    for tick, row in enumerate(columns.tolist()):
-        yield manoeuvre(robot, tick, Manoeuvre(*row))
+    return [Manoeuvre(*row) for row in (columns + 0.0).tolist()]
 
 
 class NoAnchors(UserError):
