@@ -97,8 +97,7 @@ def plan_alone(
         margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
         loss = OUTSIDE_COST if within is not None else OUTSIDE_COST_ALONE
         cost += one.probability * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
-    i = int(np.argmin(cost))
-    return Controls(float(ways.v[i]), float(ways.omega[i]))
+    return ways.controls(int(np.argmin(cost)))
 
 
 def plan_together(
@@ -141,10 +140,7 @@ def _planned_together(
     if resting != "a":
         of_a = objective if resting == "b" else objective._replace(standing_cost=0.0)
         a, _ = _best_of(ways, hypotheses, m2, rho, mission, every, np.array([b]), of_a)
-    return (
-        Controls(float(ways.v[a]), float(ways.omega[a])),
-        Controls(float(ways.v[b]), float(ways.omega[b])),
-    )
+    return ways.controls(a), ways.controls(b)
 
 
 def _best_of(
@@ -189,29 +185,16 @@ def _best_of(
         nx, ny = dx / distance, dy / distance
         weight = (distance <= reach) / sigma
         for robot, (x, y), sign in ((0, (ax, ay), 1.0), (1, (bx, by), -1.0)):
-            px, py = one.poses[3 * robot : 3 * robot + 2]
-            i = 3 * robot
-            rows[:, :ahead, i] = sign * nx * weight
-            rows[:, :ahead, i + 1] = sign * ny * weight
-            rows[:, :ahead, i + 2] = sign * (ny * (x - px) - nx * (y - py)) * weight
+            moved = x - one.poses[3 * robot], y - one.poses[3 * robot + 1]
             ox, oy = x - anchors[robot][0], y - anchors[robot][1]
             rho = np.maximum(hypot(ox, oy), SIGMA_FLOOR)
-            own = (rho <= reach) / rho / own_sigma
-            own_rows = slice((robot + 1) * ahead, (robot + 2) * ahead)
-            rows[:, own_rows, i] = ox * own
-            rows[:, own_rows, i + 1] = oy * own
-            rows[:, own_rows, i + 2] = (oy * (x - px) - ox * (y - py)) * own
-        covariance_after = inverted(
-            _information(one.covariance, mission) + product(np.swapaxes(rows, 1, 2), rows)
-        )
+            own, own_rows = (rho <= reach) / rho / own_sigma, slice((robot + 1) * ahead, (robot + 2) * ahead)
+            effects = zip(_effects(nx, ny, *moved), _effects(ox, oy, *moved), strict=True)
+            for i, (of_mutual, of_own) in enumerate(effects, 3 * robot):
+                rows[:, :ahead, i], rows[:, own_rows, i] = sign * of_mutual * weight, of_own * own
+        after = _after(one.covariance, rows, mission)
         for i, (x, y) in ((0, (ax, ay)), (3, (bx, by))):
-            dx, dy = x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1]
-            variance = (
-                covariance_after[:, i, i]
-                + covariance_after[:, i + 1, i + 1]
-                + (dx * dx + dy * dy) * covariance_after[:, i + 2, i + 2]
-            )
-            variance += 2.0 * (dx * covariance_after[:, i + 1, i + 2] - dy * covariance_after[:, i, i + 2])
+            variance = _position_variance(after, i, x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1])
             cost += variance / mission.accuracy**2
     cost += _confusion(hypotheses, distances, sigma, reach)
     cost[-1] += objective.standing_cost
@@ -263,6 +246,24 @@ NEAREST_TO_ANCHOR = 0.06
 
 From nearer points, odometry noise would leave open on which side of the anchor the robot is.
 """
+
+
+def _effects(nx: Array, ny: Array, lx: Array, ly: Array) -> tuple[Array, Array, Array]:
+    """Return the derivatives of ranges along (nx, ny) by a pose, after a motion (lx, ly) from it, in m."""
+    return nx, ny, ny * lx - nx * ly
+
+
+def _after(covariance: Array, rows: Array, mission: Mission) -> Array:
+    """Return the `covariance` after ranges whose derivatives in their sigmas are `rows`, (C, N, n)."""
+    return inverted(_information(covariance, mission) + product(np.swapaxes(rows, 1, 2), rows))
+
+
+def _position_variance(covariance: Array, i: int, dx: Array, dy: Array) -> Array:
+    """Return the variance (m^2) of a position after a motion (dx, dy) from the pose at `i`, (C,)."""
+    variance = covariance[:, i, i] + covariance[:, i + 1, i + 1]
+    variance += (dx * dx + dy * dy) * covariance[:, i + 2, i + 2]
+    variance += 2.0 * (dx * covariance[:, i + 1, i + 2] - dy * covariance[:, i, i + 2])
+    return np.asarray(variance, np.float64)
 
 
 def _information(covariance: Array, mission: Mission) -> Array:
@@ -335,16 +336,11 @@ def plan_among(
             continue
         nx, ny, weight = dx / distance, dy / distance, (distance <= reach) / sigma
         lx, ly = x[:, :, None] - one.poses[0], y[:, :, None] - one.poses[1]
-        rows = np.stack((nx * weight, ny * weight, (ny * lx - nx * ly) * weight), -1).reshape(
-            len(cost), -1, 3
-        )
-        after = inverted(_information(one.covariance, mission) + product(np.swapaxes(rows, 1, 2), rows))
-        lx, ly = lx[:, -1, 0], ly[:, -1, 0]
-        variance = after[:, 0, 0] + after[:, 1, 1] + (lx * lx + ly * ly) * after[:, 2, 2]
-        variance += 2.0 * (lx * after[:, 1, 2] - ly * after[:, 0, 2])
+        rows = np.stack([effect * weight for effect in _effects(nx, ny, lx, ly)], -1)
+        after = _after(one.covariance, rows.reshape(len(cost), -1, 3), mission)
+        variance = _position_variance(after, 0, lx[:, -1, 0], ly[:, -1, 0])
         variance += turned**2 * (x[:, -1] ** 2 + y[:, -1] ** 2)
         cost += variance / mission.accuracy**2 + after[:, 2, 2] / HEADING_ACCURACY**2
     cost += _confusion([one.planned for one in hypotheses], distances, sigma, reach)
     cost[-1] += STALLED_COST
-    best = int(np.argmin(cost))
-    return Controls(float(ways.v[best]), float(ways.omega[best]))
+    return ways.controls(int(np.argmin(cost)))

@@ -14,7 +14,7 @@ from agent.estimation.gaussian.joint_ranges import MOVED
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, ratio_of_chord
 from agent.planning import separation
 from protocol.mission import Mission
-from protocol.motion import Pose, placed
+from protocol.motion import Controls, Pose, placed
 
 STRIDE_LENGTH = 0.25
 """The minimum length of a manoeuvre, as a fraction of R. A manoeuvre lasts as many ticks as that takes."""
@@ -54,6 +54,10 @@ class Choice(NamedTuple):
     def ends(self, pose: Array, some: Places | slice = slice(None)) -> tuple[Array, Array]:
         """Return the positions in m after each stride of the manoeuvres `some` from `pose`; (C, strides)."""
         return placed(Pose(*pose), self.along[some], self.across[some])
+
+    def controls(self, i: int) -> Controls:
+        """Return the controls of the manoeuvre with the index `i`."""
+        return Controls(float(self.v[i]), float(self.omega[i]))
 
     def way(self, pose: Array, some: Places) -> tuple[Array, Array]:
         """Return the positions in m during the first stride of the manoeuvres `some`; (C, CHORDS)."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array, Places
-from agent.estimation.gaussian.range_model import LARGEST_RATIO, STRAY_WIDTH
+from agent.estimation.gaussian.range_model import LARGEST_RATIO, mixture
 from agent.estimation.smoother import Measured, Vector
 from protocol.noise import Noise
 
@@ -75,17 +75,11 @@ class Weighing(NamedTuple):
         noisy: bool,
     ) -> Weighing:
         """Return what the weights depend on, with the shares and densities of `noise`."""
+        inlier, outlier, stray, least, most = mixture(noise).tolist()
+        astray = noise.odometry_strays
+        ratio = math.log(astray / (1.0 - astray)) if astray else 0.0
         return Weighing(
-            sigma,
-            holding,
-            by_radio,
-            longest,
-            math.log1p(-noise.outliers - noise.strays) - 0.5 * math.log(2.0 * math.pi),
-            math.log(noise.outliers) if noise.outliers else -math.inf,
-            math.log(noise.strays / STRAY_WIDTH) if noise.strays else -math.inf,
-            noise.odometry_strays,
-            math.log(noise.odometry_strays / (1.0 - noise.odometry_strays)) if noise.odometry_strays else 0.0,
-            *noise.outlier_bias,
+            *(sigma, holding, by_radio, longest, inlier, outlier, stray, astray, ratio, least, most),
             noise.sigma_degrees,
             free,
             bool(noise.outliers or noise.strays),
