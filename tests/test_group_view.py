@@ -10,7 +10,7 @@ from matplotlib.text import Annotation
 from msgspec.structs import replace
 from playwright.sync_api import expect
 
-from agent.process.planner_replay import PlannerReplay
+from agent.process.robot import PlannerReplay
 from compose.figures import catalogue
 from compose.figures.agent_replay import agent_replay
 from compose.figures.pair import PairRecord, pairs_of

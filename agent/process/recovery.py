@@ -13,8 +13,7 @@ import msgspec
 
 from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport, agent_history
-from agent.process.planner_replay import PlannerReplay
-from agent.process.robot import REPORTS_KEPT, Robot
+from agent.process.robot import REPORTS_KEPT, PlannerReplay, Robot
 from protocol.journal import environment
 from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import ReplayMismatch, Retrace

@@ -7,9 +7,8 @@ from typing import Any
 
 from agent.planning.planner import Planner
 from agent.process.agent_journal import Step
-from agent.process.planner_replay import PlannerReplay
 from agent.process.report_bodies import body_of
-from agent.process.robot import Robot
+from agent.process.robot import PlannerReplay, Robot
 from compose.audit.findings import Checks, Violation, unlike
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run

@@ -10,7 +10,7 @@ from agent.planning.group import GroupPlanner
 from agent.planning.planner import Planner
 from agent.planning.state import RobotState
 from agent.process.agent_journal import AgentHistory
-from agent.process.planner_replay import PlannerReplay
+from agent.process.robot import PlannerReplay
 from compose.errors import UserError
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
