@@ -16,13 +16,14 @@ from msgspec.structs import replace
 
 from agent.estimation import closed_forms, posterior
 from agent.estimation.closed_forms import Placement, same_placement
+from agent.estimation.compiled import address, library
 from agent.estimation.fit import fits
 from agent.estimation.gauss_newton import Convergence, Fitted
 from agent.estimation.gaussian import claim_rivals, evidence, inference, placement_guesses
 from agent.estimation.gaussian import search as searching
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import FINISHED, consistency_test
-from agent.estimation.gaussian.detections import detection_log_likelihoods, no_detection_log_likelihood
+from agent.estimation.gaussian.detections import SILENT, detection_log_likelihoods
 from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.joint_ranges import (
     MOST_CORRELATED_RANGES,
@@ -63,6 +64,11 @@ def by_quadrature(beyond: Sequence[float], sigma: float, drop_outs: float) -> fl
     return float(np.sum(density * np.prod(np.where(out, 1.0, drop_outs), 0)) * (error[1] - error[0]))
 
 
+def no_detection(beyond: list[float], sigma: float, drop_outs: float) -> float:
+    """Return the log-likelihood of ticks without a detection `beyond` R (m), by the kernel."""
+    return float(library().no_detection(len(beyond), address(np.array(beyond)), sigma, drop_outs, SILENT))
+
+
 margins = st.lists(st.floats(-1.0, 1.0), min_size=1, max_size=8)
 
 
@@ -71,26 +77,19 @@ def test_the_likelihood_of_no_detection_is_a_mean_over_the_common_error(
     beyond: list[float], sigma: float, drop_outs: float
 ) -> None:
     mean = by_quadrature(beyond, sigma, drop_outs)
-    assert math.exp(no_detection_log_likelihood(np.array(beyond), sigma, drop_outs)) == pytest.approx(
-        mean, rel=1e-2, abs=1e-3
-    )
+    assert math.exp(no_detection(beyond, sigma, drop_outs)) == pytest.approx(mean, rel=1e-2, abs=1e-3)
 
 
 def test_no_detection_far_out_of_range_has_probability_one() -> None:
-    assert no_detection_log_likelihood(np.array([]), 0.1, 0.1) == 0.0
-    assert no_detection_log_likelihood(np.array([5.0, 7.0]), 0.1, 0.0) == pytest.approx(0.0, abs=1e-12)
-    assert no_detection_log_likelihood(np.array([5.0, 7.0]), 0.1, 0.1) == pytest.approx(0.0, abs=1e-12)
+    assert no_detection([], 0.1, 0.1) == 0.0
+    assert no_detection([5.0, 7.0], 0.1, 0.0) == pytest.approx(0.0, abs=1e-12)
+    assert no_detection([5.0, 7.0], 0.1, 0.1) == pytest.approx(0.0, abs=1e-12)
 
 
 def test_no_detection_in_range_has_the_probability_of_its_drop_outs() -> None:
-    assert no_detection_log_likelihood(np.array([-1.0, -2.0, 3.0]), 0.1, 0.1) == pytest.approx(
-        2.0 * math.log(0.1)
-    )
-    assert no_detection_log_likelihood(np.array([-10.0]), 0.1, 0.0) == pytest.approx(-5000.0, rel=2e-3)
-    falling = [
-        no_detection_log_likelihood(np.array([-0.1 * sigmas]), 0.1, 0.0)
-        for sigmas in np.linspace(-5.0, 60.0, 131)
-    ]
+    assert no_detection([-1.0, -2.0, 3.0], 0.1, 0.1) == pytest.approx(2.0 * math.log(0.1))
+    assert no_detection([-10.0], 0.1, 0.0) == pytest.approx(-5000.0, rel=2e-3)
+    falling = [no_detection([-0.1 * sigmas], 0.1, 0.0) for sigmas in np.linspace(-5.0, 60.0, 131)]
     assert all(later < earlier for earlier, later in pairwise(falling)), "down to the farthest tail"
 
 

@@ -9,15 +9,14 @@ import numpy as np
 from agent.estimation.compiled import address, library
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.odometry_noise import Array
 
 
 def detection_log_likelihoods(found: Sequence[Fit], measured: JointMeasurements) -> list[float]:
     """Return the log-likelihood of all detections and of the ticks without one, given each fit.
 
-    It is 0 if a missing range says nothing. The error of a prediction is common to all ticks (see
-    `no_detection_log_likelihood`): that of the tick in which the beacon was nearest, or in which it was
-    farthest and detected.
+    It is 0 if a missing range says nothing. The error of a prediction is common to all ticks, because they
+    lie on one path: that of the tick in which the beacon was nearest, or in which it was farthest and
+    detected. A tick within R has no detection with the probability of drop-outs.
     """
     if not measured.silent:
         return [0.0] * len(found)
@@ -46,16 +45,6 @@ EDGE = 0.005
 
 CLEAR = 0.5
 """The fraction of R beyond R from which a tick without a detection contains no information."""
-
-
-def no_detection_log_likelihood(beyond: Array, sigma: float, drop_outs: float) -> float:
-    """Return the log-likelihood of no detection at several ticks.
-
-    `beyond` is the predicted distance (m) beyond R at each of these ticks. The prediction has an error of
-    standard deviation `sigma` (m), which is common to all ticks because they lie on one path. A tick within R
-    has no detection with the probability `drop_outs`.
-    """
-    return float(library().no_detection(len(beyond), address(beyond.copy()), sigma, drop_outs, SILENT))
 
 
 SILENT = 12
