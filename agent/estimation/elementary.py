@@ -8,6 +8,7 @@ square roots are exactly rounded in numpy, too.
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 
@@ -15,29 +16,23 @@ from agent.estimation.compiled import address, library
 from agent.estimation.smoother import Array, Singular
 
 
-def exp(x: Array) -> Array:
-    """Return the exponential of each element."""
-    return _of_each("each_exp", x)
+def _of_each(name: str) -> Callable[[Array], Array]:
+    """Return the C function `name` of each element of an array."""
+
+    def function(x: Array) -> Array:
+        x = np.ascontiguousarray(x, np.float64)
+        to = np.empty(x.shape)
+        getattr(library(), f"each_{name}")(x.size, address(x), address(to))
+        return to
+
+    return function
 
 
-def log(x: Array) -> Array:
-    """Return the natural logarithm of each element."""
-    return _of_each("each_log", x)
+exp, log = _of_each("exp"), _of_each("log")
+"""The exponential and the natural logarithm of each element."""
 
-
-def cos(x: Array) -> Array:
-    """Return the cosine of each element (rad)."""
-    return _of_each("each_cos", x)
-
-
-def sin(x: Array) -> Array:
-    """Return the sine of each element (rad)."""
-    return _of_each("each_sin", x)
-
-
-def tan(x: Array) -> Array:
-    """Return the tangent of each element (rad)."""
-    return _of_each("each_tan", x)
+cos, sin, tan = _of_each("cos"), _of_each("sin"), _of_each("tan")
+"""The cosine, the sine and the tangent of each element (rad)."""
 
 
 def logaddexp(one: Array, other: Array) -> Array:
@@ -104,11 +99,3 @@ def eigh(matrix: Array) -> tuple[Array, Array]:
     values = np.diagonal(diagonal)
     order = np.argsort(values, kind="stable")
     return values[order], vectors[:, order]
-
-
-def _of_each(name: str, x: Array) -> Array:
-    """Return the C function `name` of each element."""
-    x = np.ascontiguousarray(x, np.float64)
-    to = np.empty(x.shape)
-    getattr(library(), name)(x.size, address(x), address(to))
-    return to
