@@ -297,12 +297,6 @@ class Projection(NamedTuple):
         weights[..., 1:, :] = u
         return Projection(ticks, weights)
 
-    def then(self, more: Projection) -> Projection:
-        """Return these rows followed by `more` of the same robot."""
-        tick = np.concatenate((self.ticks.tick, more.ticks.tick))
-        weights = np.concatenate((self.weights, more.weights), axis=-1)
-        return Projection(Ticks.of(tick, self.ticks.k), weights)
-
     @staticmethod
     def pose(path: Track, tick: int, turn: float = 0.0) -> Projection:
         """Return the rows for the x, y and heading at `tick`, with x and y rotated by `turn` (rad)."""
