@@ -228,11 +228,8 @@ class LogPlanner(Planner[RobotState, Report]):
         if (attack := state.config.attack) is not None:
             start = false_reports.start(start, attack) if start is not None else None
         unacknowledged = log.after(since, ranges_since)
-        return Report(
-            tick=state.tick,
-            robot=state.config.robot,
-            phase=state.phase,
-            state=state.task.name,
+        return replace(
+            report_without_log(state, state.verdict),
             start=start,
             since=since,
             through=unacknowledged.through,
@@ -241,7 +238,6 @@ class LogPlanner(Planner[RobotState, Report]):
             ranges=unacknowledged.ranges,
             heard=state.peer_state.peer.through,
             ranges_heard=len(state.peer_state.peer.ranges),
-            verdict=state.verdict,
         )
 
     def estimate(self, state: RobotState) -> Estimate:
