@@ -48,6 +48,9 @@ static const double SHORTER_STEPS[] = {1.0, 0.5, 0.25, 0.0625};
 
 typedef long long Index;
 
+/* A function that is compiled for each of the sizes of BY_SIZE. */
+#define SIZED static inline __attribute__((always_inline))
+
 /* smoother.Measured: first the numbers, then the arrays. */
 typedef struct {
     Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed, strays;
@@ -119,17 +122,17 @@ static double smaller(double one, double other) { return other < one ? other : o
 
 /* --- linear algebra --------------------------------------------------------------------------------- */
 
-static void add(double *to, double factor, const double *what, Index count)
+SIZED void add(double *restrict to, double factor, const double *restrict what, Index count)
 {
     for (Index e = 0; e < count; e++) to[e] += factor * what[e];
 }
 
-static void scale(double *vector, double factor, Index count)
+SIZED void scale(double *vector, double factor, Index count)
 {
     for (Index e = 0; e < count; e++) vector[e] *= factor;
 }
 
-static double dot(const double *one, const double *other, Index count)
+SIZED double dot(const double *one, const double *other, Index count)
 {
     double total = 0.0;
     for (Index e = 0; e < count; e++) total += one[e] * other[e];
@@ -137,7 +140,7 @@ static double dot(const double *one, const double *other, Index count)
 }
 
 /* `matrix` has rows of `width` elements, and `lower` of `end - begin`. Returns 0 if it is not positive. */
-static int cholesky(const double *matrix, Index width, Index begin, Index end, double *lower)
+SIZED int cholesky(const double *matrix, Index width, Index begin, Index end, double *lower)
 {
     const Index size = end - begin;
     memset(lower, 0, sizeof(double) * size * size);
@@ -151,13 +154,13 @@ static int cholesky(const double *matrix, Index width, Index begin, Index end, d
     return 1;
 }
 
-static void substituted(const double *lower, Index size, const double *right, double *found)
+SIZED void substituted(const double *lower, Index size, const double *right, double *found)
 {
     for (Index a = 0; a < size; a++)
         found[a] = (right[a] - dot(lower + a * size, found, a)) / lower[a * size + a];
 }
 
-static void solved(const double *lower, Index size, const double *right, double *found)
+SIZED void solved(const double *lower, Index size, const double *right, double *found)
 {
     substituted(lower, size, right, found);
     for (Index a = size - 1; a >= 0; a--) {
@@ -166,7 +169,7 @@ static void solved(const double *lower, Index size, const double *right, double 
     }
 }
 
-static void inverted(const double *lower, Index size, double *right, double *column, double *inverse)
+SIZED void inverted(const double *lower, Index size, double *right, double *column, double *inverse)
 {
     memset(right, 0, sizeof(double) * size);
     for (Index e = 0; e < size; e++) {
@@ -179,11 +182,11 @@ static void inverted(const double *lower, Index size, double *right, double *col
 
 /* --- sizes ------------------------------------------------------------------------------------------ */
 
-static Index states(const Measured *of) { return 3 * of->robots + of->radios; }
+SIZED Index states(const Measured *of) { return 3 * of->robots + of->radios; }
 
-static Index estimated(const Measured *of) { return 3 * of->robots + of->common + of->robots * of->constant; }
+SIZED Index estimated(const Measured *of) { return 3 * of->robots + of->common + of->robots * of->constant; }
 
-static Index unknowns(const Measured *of) { return estimated(of) + 2 * of->anchors; }
+SIZED Index unknowns(const Measured *of) { return estimated(of) + 2 * of->anchors; }
 
 /* --- the paths -------------------------------------------------------------------------------------- */
 
@@ -257,7 +260,7 @@ void walked(const Measured *of, const double *poses, const double *constants, co
 }
 
 /* The derivatives of the start pose of robot `i` with respect to its unknowns. */
-static void basis_of(const Measured *of, const double *poses, Index i, double by[3][3])
+SIZED void basis_of(const Measured *of, const double *poses, Index i, double by[3][3])
 {
     double x = poses[3 * i] - of->pivot[2 * i], y = poses[3 * i + 1] - of->pivot[2 * i + 1];
     if (isnan(x)) x = y = 0.0;
@@ -268,7 +271,7 @@ static void basis_of(const Measured *of, const double *poses, Index i, double by
 
 /* --- the forward pass ------------------------------------------------------------------------------- */
 
-static void moved(const Measured *of, const Walk *walk, Index i, Index k, Work *w)
+SIZED void moved(const Measured *of, const Walk *walk, Index i, Index k, Work *w)
 {
     const Index s = states(of), q = unknowns(of), K = of->ticks, m = of->constant;
     const double *move = walk->moves + 8 * (i * K + k), T = of->period;
@@ -301,7 +304,7 @@ static void moved(const Measured *of, const Walk *walk, Index i, Index k, Work *
             p[(x + a) * s + x + e] += v * by_v[a] * by_v[e] + omega * by_omega[a] * by_omega[e];
 }
 
-static void decayed(const Measured *of, Work *w)
+SIZED void decayed(const Measured *of, Work *w)
 {
     const Index s = states(of), q = unknowns(of);
     for (Index a = 3 * of->robots; a < s; a++) {
@@ -313,7 +316,7 @@ static void decayed(const Measured *of, Work *w)
     }
 }
 
-static Row row_of(const Measured *of, const Walk *walk, Index j)
+SIZED Row row_of(const Measured *of, const Walk *walk, Index j)
 {
     const double x = walk->direction[2 * j], y = walk->direction[2 * j + 1];
     Row row = {{3 * of->first[j], 3 * of->first[j] + 1}, {x, y}, 2};
@@ -331,7 +334,7 @@ static Row row_of(const Measured *of, const Walk *walk, Index j)
 }
 
 /* The effect of one sigma of the constant error `e` on range `j`. */
-static double effect_of(const Measured *of, const Walk *walk, Index j, Index e)
+SIZED double effect_of(const Measured *of, const Walk *walk, Index j, Index e)
 {
     const double told = of->effects[j * of->common + e];
     if (e == of->delayed) return -told * walk->rate[j];
@@ -339,7 +342,7 @@ static double effect_of(const Measured *of, const Walk *walk, Index j, Index e)
 }
 
 /* Returns 0 if rounding has left no variance. */
-static int measured(const Measured *of, const Walk *walk, Index j, double variance, Work *w)
+SIZED int measured(const Measured *of, const Walk *walk, Index j, double variance, Work *w)
 {
     const Index s = states(of), q = unknowns(of), size = estimated(of);
     const Row row = row_of(of, walk, j);
@@ -361,7 +364,7 @@ static int measured(const Measured *of, const Walk *walk, Index j, double varian
     return variance > 0.0;
 }
 
-static void updated(const Measured *of, Index j, Work *w)
+SIZED void updated(const Measured *of, Index j, Work *w)
 {
     const Index s = states(of), q = unknowns(of);
     const double innovation = w->innovation[j], weight = 1.0 / w->variance[j];
@@ -379,7 +382,7 @@ static void updated(const Measured *of, Index j, Work *w)
 }
 
 /* Set the effects of the unknowns of the start poses on them, and what their priors tell. */
-static void begun(const Measured *of, const double *poses, Work *w)
+SIZED void begun(const Measured *of, const double *poses, Work *w)
 {
     const Index n3 = 3 * of->robots, q = unknowns(of);
     double by[3][3], *told = w->vector, *row = w->other;
@@ -404,7 +407,7 @@ static void begun(const Measured *of, const double *poses, Work *w)
     }
 }
 
-static int forward(
+SIZED int forward(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, int update, Work *w)
 {
     const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of);
@@ -429,7 +432,7 @@ static int forward(
     return 1;
 }
 
-int loosened(
+SIZED int sized_loosened(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, Work *w, double *found)
 {
     const Index q = unknowns(of), size = estimated(of);
@@ -444,7 +447,7 @@ int loosened(
 
 /* --- the step --------------------------------------------------------------------------------------- */
 
-static int limited(const Measured *of, double largest, const double *change, Work *w, double *found)
+SIZED int limited(const Measured *of, double largest, const double *change, Work *w, double *found)
 {
     const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
     double most = 0.0;
@@ -462,7 +465,7 @@ static int limited(const Measured *of, double largest, const double *change, Wor
     return 1;
 }
 
-static double chi2_of(const Measured *of, const double *poses, const double *change, Work *w)
+SIZED double chi2_of(const Measured *of, const double *poses, const double *change, Work *w)
 {
     const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
     double chi2 = 0.0, by[3][3], *off = w->vector;
@@ -479,7 +482,7 @@ static double chi2_of(const Measured *of, const double *poses, const double *cha
     return chi2;
 }
 
-static double told_by(const Measured *of, const Walk *walk, Index j, Work *w, double *precision)
+SIZED double told_by(const Measured *of, const Walk *walk, Index j, Work *w, double *precision)
 {
     const Index s = states(of), q = unknowns(of), size = estimated(of);
     const double *gain = w->gain + j * s, spread = w->variance[j];
@@ -504,7 +507,7 @@ static double told_by(const Measured *of, const Walk *walk, Index j, Work *w, do
     return here;
 }
 
-static void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Work *w, Step *to)
+SIZED void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Work *w, Step *to)
 {
     const Index s = states(of), size = estimated(of), x = 3 * i;
     const double *move = walk->moves + 8 * (i * of->ticks + k);
@@ -531,7 +534,7 @@ static void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Wor
     }
 }
 
-static void attributed(const Measured *of, const Walk *walk, Index i, Index k, Work *w, Step *to)
+SIZED void attributed(const Measured *of, const Walk *walk, Index i, Index k, Work *w, Step *to)
 {
     const Index s = states(of), size = estimated(of), K = of->ticks, x = 3 * i, y = 3 * i + 1, h = 3 * i + 2;
     const double *move = walk->moves + 8 * (i * K + k);
@@ -554,7 +557,7 @@ static void attributed(const Measured *of, const Walk *walk, Index i, Index k, W
     }
 }
 
-static void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
+SIZED void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
 {
     const Index s = states(of), size = estimated(of);
     memset(w->told, 0, sizeof(double) * s);
@@ -583,7 +586,7 @@ static void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
     }
 }
 
-static void slow_errors(const Measured *of, Work *w, Step *to)
+SIZED void slow_errors(const Measured *of, Work *w, Step *to)
 {
     double *before = w->vector, *after = w->other;
     memset(to->slow, 0, sizeof(double) * of->ranges);
@@ -608,7 +611,7 @@ static void slow_errors(const Measured *of, Work *w, Step *to)
     }
 }
 
-static void ends_of(const Measured *of, Work *w, Step *to)
+SIZED void ends_of(const Measured *of, Work *w, Step *to)
 {
     const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of), size = estimated(of);
     double *spread = w->vector, *effect = w->other;
@@ -625,10 +628,9 @@ static void ends_of(const Measured *of, Work *w, Step *to)
     }
 }
 
-/* smoother.step; glibc has a function of that name, which would be called in its place. Returns 0 if the
-   information of the unknowns is not positive definite. */
-int gauss_newton_step(const Measured *of, const Walk *walk, const double *poses, const double *variance,
-                      double ridge, double largest, Work *w, Step *to)
+SIZED int sized_step(
+    const Measured *of, const Walk *walk, const double *poses, const double *variance, double ridge,
+    double largest, Work *w, Step *to)
 {
     const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
     if (!forward(of, walk, poses, variance, 1, w)) return 0;
@@ -656,6 +658,37 @@ int gauss_newton_step(const Measured *of, const Walk *walk, const double *poses,
     to->numbers[2] = volume;
     to->numbers[3] = of_start;
     return 1;
+}
+
+/* Return what `call` returns with `of`, compiled once more for the sizes that most fits of missions have: a robot,
+   or two, without further errors. */
+#define BY_SIZE(of, call)                                                                  \
+    const int plain = !(of->common || of->constant || of->anchors || of->radios);          \
+    Measured sized = *of;                                                                  \
+    of = &sized;                                                                           \
+    if (plain) sized.common = sized.constant = sized.anchors = sized.radios = 0;           \
+    if (plain && sized.robots == 2) {                                                      \
+        sized.robots = 2;                                                                  \
+        return call;                                                                       \
+    }                                                                                      \
+    if (plain && sized.robots == 1) {                                                      \
+        sized.robots = 1;                                                                  \
+        return call;                                                                       \
+    }                                                                                      \
+    return call;
+
+int loosened(
+    const Measured *of, const Walk *walk, const double *poses, const double *variance, Work *w, double *found)
+{
+    BY_SIZE(of, sized_loosened(of, walk, poses, variance, w, found))
+}
+
+/* smoother.step; glibc has a function of that name, which would be called in its place. Returns 0 if the
+   information of the unknowns is not positive definite. */
+int gauss_newton_step(const Measured *of, const Walk *walk, const double *poses, const double *variance,
+                      double ridge, double largest, Work *w, Step *to)
+{
+    BY_SIZE(of, sized_step(of, walk, poses, variance, ridge, largest, w, to))
 }
 
 /* --- weights of ranges ------------------------------------------------------------------------------ */
