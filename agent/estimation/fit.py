@@ -183,21 +183,32 @@ def fits(
 ) -> list[Fit]:
     """Return the fits to all ranges in `measured` that begin at `starts`.
 
-    Fits also begin at the first `doubted` ones without their outliers. A start from which there is no fit,
-    because a number is too large for a float, is left out. A solver of the user converges by its own rule,
-    and `until` does not count.
+    Fits also begin at the first `doubted` ones without their outliers, unless the fit from there leaves out the
+    same ranges. A start from which there is no fit, because a number is too large for a float, is left out. A
+    solver of the user converges by its own rule, and `until` does not count.
     """
-    problem, found, starts = Problem.of(measured), [], list(starts)
-    for start in (*starts, *_without_outliers(problem, measured, starts[:doubted])):
-        try:
-            if measured.solver is not None:
-                _lock((measured, start))
-                found += _solved(problem, measured.solver.solve(measured, start))
-            else:
-                found.append(_fit(problem, problem.kernel.fitted(*_begin(problem, start), until)))
-        except Singular:
-            continue
-    return found
+    problem, starts = Problem.of(measured), list(starts)
+    found = [_fits_from(problem, measured, start, until) for start in starts]
+    for start, before in zip(_without_outliers(problem, measured, starts[:doubted]), found, strict=False):
+        if start is not None and not any(_leaves_out(one, start.weights) for one in before):
+            found.append(_fits_from(problem, measured, start, until))
+    return [one for each in found for one in each]
+
+
+def _fits_from(problem: Problem, measured: JointMeasurements, start: Start, until: Convergence) -> list[Fit]:
+    """Return the fit from `start`; none if a number is too large for a float."""
+    try:
+        if measured.solver is not None:
+            _lock((measured, start))
+            return _solved(problem, measured.solver.solve(measured, start))
+        return [_fit(problem, problem.kernel.fitted(*_begin(problem, start), until))]
+    except Singular:
+        return []
+
+
+def _leaves_out(fit: Fit, weights: Array | None) -> bool:
+    """Return whether the outliers of a fit are those by `weights`."""
+    return weights is not None and bool(np.array_equal(fit.weights > INLIER, weights > INLIER))
 
 
 def _lock(value: object) -> None:
@@ -300,8 +311,10 @@ def held_fits(measured: JointMeasurements, begun: Fit, held: Sequence[tuple[floa
     return found
 
 
-def _without_outliers(problem: Problem, measured: JointMeasurements, starts: Sequence[Start]) -> list[Start]:
-    """Return the `starts` under which some range is an outlier, with weights that leave these ranges out.
+def _without_outliers(
+    problem: Problem, measured: JointMeasurements, starts: Sequence[Start]
+) -> list[Start | None]:
+    """Return the `starts` with weights that leave out the ranges that are outliers there; None without any.
 
     The weights follow from the residuals and the sigmas of the ranges alone, as if the start were exact.
     Without them, a fit first allows for the uncertainty of the odometry too, which can explain an outlier
@@ -309,13 +322,12 @@ def _without_outliers(problem: Problem, measured: JointMeasurements, starts: Seq
     """
     if not (starts and problem.weighing.robust):
         return []
-    kernel, found = problem.kernel, []
+    kernel, found = problem.kernel, list[Start | None]()
     sigma = np.sqrt(np.square(measured.ranges.sigma) + measured.loosened)[problem.order]
     for start in starts:
         poses, constant, white, _ = _begin(problem, start)
         weights = kernel.weights_by_errors(kernel.walked(poses, constant, white).residual, sigma)
-        if weights.min() < INLIER:
-            found.append(start._replace(weights=weights[problem.back]))
+        found.append(start._replace(weights=weights[problem.back]) if weights.min() < INLIER else None)
     return found
 
 
