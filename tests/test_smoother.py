@@ -132,9 +132,10 @@ def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
     group = moving_group(robots, seed, ticks=7, noise=noise)
     measured = joint_measurements(group.facts, noise, PERIOD_S)
     problem = Problem.of(measured)
-    of, by, kernel, rng = problem.measured, problem.weighing, problem.kernel, np.random.default_rng(seed)
+    of, by, rng = problem.measured, problem.weighing, np.random.default_rng(seed)
     by.holding[-1] = 1
     of.radio[-1] = -1
+    kernel = Kernel(of, by)
     poses = (group.starts - (*measured.origin, 0.0)).ravel() + rng.normal(size=3 * robots)
     _, constant, white = point_of(of, seed)
     nothing, zero = np.zeros(len(of.rho)), np.zeros(of.common.shape[1])

@@ -33,7 +33,7 @@ def library() -> ctypes.CDLL:
         text = b"".join([source.read_bytes() for source in SOURCE_FILES])
         if found.source() != hashlib.sha256(text).hexdigest().encode():
             raise _no_kernel(f"one of {', '.join([source.name for source in SOURCE_FILES])} is another")
-    for name in ("walked", "guess", "weights_by_errors"):
+    for name in ("prepared", "paths", "guess", "weights_by_errors"):
         getattr(found, name).restype = None
     for name, (result, arguments) in SIGNATURES.items():
         getattr(found, name).argtypes = [TYPES[one] for one in arguments]

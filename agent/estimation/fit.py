@@ -183,9 +183,9 @@ def fits(
 ) -> list[Fit]:
     """Return the fits to all ranges in `measured` that begin at `starts`.
 
-    Fits also begin at the first `doubted` ones without their outliers, unless the fit from there leaves out the
-    same ranges. A start from which there is no fit, because a number is too large for a float, is left out. A
-    solver of the user converges by its own rule, and `until` does not count.
+    Fits also begin at the first `doubted` ones without their outliers, unless the fit from there leaves out
+    the same ranges. A start from which there is no fit, because a number is too large for a float, is left
+    out. A solver of the user converges by its own rule, and `until` does not count.
     """
     problem, starts = Problem.of(measured), list(starts)
     found = [_fits_from(problem, measured, start, until) for start in starts]

@@ -6,14 +6,11 @@ Its functions are those of `smoother` and `gauss_newton`, and equal to the bit.
 from __future__ import annotations
 
 import ctypes
-import math
-from itertools import accumulate, pairwise
 
 import numpy as np
 
 from agent.estimation.compiled import Pointer, address, library
 from agent.estimation.gauss_newton import Convergence, Fitted, Point
-from agent.estimation.gaussian.odometry_noise import Places
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.estimation.smoother import Array, FitStep, Measured, Singular, Walk
 
@@ -49,46 +46,36 @@ class _Convergence(ctypes.Structure):
 
 
 class Kernel:
-    """The functions of `smoother` and `gauss_newton` for the measurements of a fit, with a workspace."""
+    """The functions of `smoother` and `gauss_newton` for the measurements of a fit."""
 
     def __init__(self, of: Measured, by: Weighing) -> None:
-        """Prepare the workspace."""
-        self.of = of = Measured._make(
-            [np.ascontiguousarray(one) if isinstance(one, np.ndarray) else one for one in of]
-        )
-        self.by = by  # the kernel has the addresses of its arrays
+        """Give the kernel the measurements, of which it has a copy."""
+        self.of, self.by = of, by
         n, k, count, c, m = of.robots, of.ticks, len(of.rho), of.common.shape[1], of.patterns.shape[1]
-        size, s, n3 = of.size, 3 * n + of.radios, 3 * n
-        q = size + 2 * of.anchors
-        arrays = (
+        floats = (
             *(of.v, of.omega, of.slip, of.white, of.stray, of.patterns, of.place, of.rho, of.common),
-            *(of.mean, of.information, of.pivot, of.begin, of.first, of.second, of.anchor, of.radio),
+            *(of.mean, of.information, of.pivot, by.sigma),
         )
-        self._memory = [address(one) for one in (*arrays, by.sigma, by.holding, by.by_radio)]
-        at = [ctypes.addressof(one) for one in self._memory]
-        self._measured = ctypes.byref(
-            _Measured(
-                *(n, k, count, c, m, of.anchors, of.radios, of.scaled, of.delayed, of.strays),
-                *(of.period, of.survey, of.slow, of.decay, of.scale),
-                *at[: len(arrays)],
-            )
+        numbers = (of.begin, of.first, of.second, of.anchor, of.radio, by.holding, by.by_radio)
+        self._floats, self._numbers = np.concatenate([one.ravel() for one in floats]), np.concatenate(numbers)
+        measured = _Measured(
+            *(n, k, count, c, m, of.anchors, of.radios, of.scaled, of.delayed, of.strays),
+            *(of.period, of.survey, of.slow, of.decay, of.scale),
         )
-        self._weighing = ctypes.byref(
-            _Weighing(
-                *(by.longest, by.inlier, by.outlier, by.stray, by.least, by.most, by.degrees),
-                *(by.astray, by.astray_ratio, by.free, by.robust, by.noisy),
-                *at[len(arrays) :],
-            )
+        weighing = _Weighing(
+            *(by.longest, by.inlier, by.outlier, by.stray, by.least, by.most, by.degrees),
+            *(by.astray, by.astray_ratio, by.free, by.robust, by.noisy),
         )
-        self._of_walk = ((n, k + 1, 3), (n, k, 8), (count, 2), count, count)
-        ticks, of_ranges = k * of.strays, (count, count, count, count, count)
-        self._of_step = (size, size, (size, size), (n, 2, k), *of_ranges, (n3, n3), (n, ticks, 5), 4)
-        of_point = (n3, c, (n, m), (n, 2, k), count, count, *self._of_walk, count, 1)
-        self._fitted = _Layout(*of_point, *of_point, *self._of_step, count, count, (n, ticks), 6)
-        vectors = (count, count, count * q, count * s, s, s * q, s * s, q * q, q)
-        spaces = (s, s * size, s * s, s, size, size * size, max(size, n3) ** 2, *[max(q, of.radios)] * 2)
-        weights = (*[count] * 4, n3, n * ticks, 2 * n * ticks)
-        self._work, self._space = _Layout(*vectors, *spaces, *weights).space()
+        self._measured, self._weighing = ctypes.byref(measured), ctypes.byref(weighing)
+        ends = np.empty(2 * POINT + STEP + 4, np.intp)
+        memory = map(address, (self._floats, self._numbers, ends))
+        library().prepared(self._measured, self._weighing, *memory)
+        self._ends = [0, *ends.tolist()]
+        size, ticks = of.size, k * of.strays
+        point = ((2, (n, m)), (3, (n, 2, k)), (WALK, (n, k + 1, 3)), (7, (n, k, 8)), (8, (count, 2)))
+        step = ((2, (size, size)), (3, (n, 2, k)), (9, (3 * n, 3 * n)), (10, (n, ticks, 5)), (14, (n, ticks)))
+        of_points = [(i + begin, shape) for begin in (0, POINT) for i, shape in point]
+        self._shapes = dict[int, tuple[int, ...]](of_points + [(i + 2 * POINT, shape) for i, shape in step])
 
     def __reduce__(self) -> tuple[type[Kernel], tuple[Measured, Weighing]]:
         """Return how to build the kernel again from a copy, which has memory of its own."""
@@ -96,18 +83,17 @@ class Kernel:
 
     def walked(self, poses: Array, constants: Array, white: Array) -> Walk:
         """Return the paths; see `smoother.walked`."""
-        at, arrays = _Layout(*self._of_walk).new()
-        library().walked(self._measured, *map(address, (poses, constants, white, at)))
+        arrays, memory = self._part(WALK, WALK + len(Walk._fields))
+        library().paths(self._measured, *map(address, (poses, constants, white, memory)))
         return Walk._make(arrays)
 
     def step(self, walk: Walk, poses: Array, variance: Array, ridge: float, largest: float) -> FitStep:
         """Return a Gauss-Newton step; see `smoother.step`. Raises Singular."""
-        at, arrays = _Layout(*self._of_step).new()
-        memory = [address(one) for one in walk]
-        of_walk = address(np.array([ctypes.addressof(one) for one in memory]))
+        arrays, memory = self._part(2 * POINT, 2 * POINT + STEP)
+        from_walk = np.concatenate([one.ravel() for one in walk])
         if not library().gauss_newton_step(
-            *(self._measured, of_walk, address(poses), address(variance)),
-            *(ctypes.c_double(ridge), ctypes.c_double(largest), address(self._work), address(at)),
+            *(self._measured, address(from_walk), address(poses), address(variance)),
+            *(ctypes.c_double(ridge), ctypes.c_double(largest), address(memory)),
         ):
             raise Singular("the ranges do not determine all unknowns")
         return _step_of(arrays)
@@ -138,75 +124,62 @@ class Kernel:
 
         Raises Singular.
         """
-        at, arrays = self._begun(poses, constant, white, weights)
-        end, weighed = ctypes.byref(_Convergence(*until)), ctypes.c_int(weights is not None)
+        ends, memory = self._ends, np.empty(self._ends[-1])
+        memory[: ends[WALK]] = 0.0
+        memory[: ends[1]], memory[ends[2] : ends[3]] = poses, constant.ravel()
+        memory[ends[3] : ends[4]] = white.ravel()
+        if weights is not None:
+            memory[ends[-5] : ends[-4]] = weights
+        end = ctypes.byref(_Convergence(*until))
         if not library().fitted(
-            self._measured, self._weighing, end, weighed, address(self._work), address(at)
+            self._measured, self._weighing, end, ctypes.c_int(weights is not None), address(memory)
         ):
             raise Singular("the ranges do not determine all unknowns, or an error is too large for a float")
-        return _fitted_of(arrays)
+        last_step, level, inliers, outliers, model, final = memory[ends[-2] :].tolist()
+        at = self._point(memory, int(model))
+        after = at if final == model else self._point(memory, int(final))
+        *of_step, weights, variance, sound, _ = self._arrays(memory, 2 * POINT, len(ends) - 1)
+        of_fit = (weights, variance, sound, last_step, level, int(inliers), outliers)
+        return Fitted(at, after, _step_of(of_step), *of_fit)
 
     def held(self, poses: Array, constant: Array, white: Array, weights: Array, steps: int) -> Fitted:
         """Return the fit in which a range holds a coordinate; see `gauss_newton.held`. Raises Singular."""
-        at, arrays = self._begun(poses, constant, white, weights)
-        number = ctypes.c_longlong(steps)
-        if not library().held(self._measured, self._weighing, number, address(self._work), address(at)):
-            raise Singular("the ranges do not determine all unknowns, or an error is too large for a float")
-        return _fitted_of(arrays)
+        return self.fitted(poses, constant, white, weights, Convergence(steps, HELD))
 
-    def _begun(
-        self, poses: Array, constant: Array, white: Array, weights: Array | None
-    ) -> tuple[Places, list[Array]]:
-        """Return the memory of a fit that begins at these start poses and errors."""
-        at, arrays = self._fitted.new()
-        of_poses, common, of_constant, of_white, slow, of_slow = arrays[:6]
-        of_poses[...], of_constant[...], of_white[...] = poses, constant, white
-        common[...] = slow[...] = of_slow[...] = 0.0
-        if weights is not None:
-            arrays[-4][...] = weights
-        return at, arrays
+    def _point(self, memory: Array, number: int) -> Point:
+        """Return the first or the second point of a fit."""
+        arrays = self._arrays(memory, number * POINT, (number + 1) * POINT)
+        *walk, own, prior_cost = arrays[WALK:]
+        return Point._make([*arrays[:WALK], Walk._make(walk), own, float(prior_cost[0])])
+
+    def _part(self, begin: int, end: int) -> tuple[list[Array], Array]:
+        """Return new arrays, those from `begin` to `end` of a fit, and their memory."""
+        memory = np.empty(self._ends[end] - self._ends[begin])
+        return self._arrays(memory, begin, end, self._ends[begin]), memory
+
+    def _arrays(self, memory: Array, begin: int, end: int, before: int = 0) -> list[Array]:
+        """Return the arrays from `begin` to `end` of a fit, whose first elements `memory` may lack."""
+        ends = self._ends
+        found = [memory[ends[i] - before : ends[i + 1] - before] for i in range(begin, end)]
+        for i, shape in self._shapes.items():
+            if begin <= i < end:
+                found[i - begin] = found[i - begin].reshape(shape)
+        return found
 
 
-POINT = len(Walk._fields) + 8
+WALK = 6
+"""The place of the walk among the arrays of a point."""
+
+POINT = WALK + len(Walk._fields) + 2
 """The number of arrays of a point."""
 
+STEP = FitStep._fields.index("shocks") + 2
+"""The number of arrays of a step, of which the last one contains its numbers."""
 
-def _point_of(arrays: list[Array]) -> Point:
-    """Return the point with these arrays."""
-    (*errors, own, prior_cost), walk = [*arrays[:6], *arrays[-2:]], Walk._make(arrays[6:-2])
-    return Point._make([*errors, walk, own, float(prior_cost[0])])
+HELD = -1.0
+"""The `Convergence.shortest` of a fit in which a range holds a coordinate."""
 
 
 def _step_of(arrays: list[Array]) -> FitStep:
-    """Return the step with these arrays, of which the last one contains its numbers."""
+    """Return the step with these arrays."""
     return FitStep._make([*arrays[:-1], *arrays[-1].tolist()])
-
-
-def _fitted_of(arrays: list[Array]) -> Fitted:
-    """Return the fit with these arrays."""
-    last_step, level, inliers, outliers, model, final = arrays[-1].tolist()
-    points = arrays[:POINT], arrays[POINT : 2 * POINT]
-    step, (weights, variance, sound, _) = _step_of(arrays[2 * POINT : -4]), arrays[-4:]
-    at = _point_of(points[int(model)])
-    after = at if final == model else _point_of(points[int(final)])
-    return Fitted(at, after, step, weights, variance, sound, last_step, level, int(inliers), outliers)
-
-
-class _Layout:
-    """Consecutive arrays in one piece of memory."""
-
-    def __init__(self, *shapes: tuple[int, ...] | int) -> None:
-        self._shapes = shapes
-        self._ends = [0, *accumulate([one if isinstance(one, int) else math.prod(one) for one in shapes])]
-        self._bytes = np.array(self._ends[:-1]) * np.dtype(np.float64).itemsize
-
-    def new(self) -> tuple[Places, list[Array]]:
-        """Return the addresses of new arrays, and the arrays."""
-        at, memory = self.space()
-        parts = zip([memory[slice(*each)] for each in pairwise(self._ends)], self._shapes, strict=True)
-        return at, [one if isinstance(shape, int) else one.reshape(shape) for one, shape in parts]
-
-    def space(self) -> tuple[Places, Array]:
-        """Return the addresses of new arrays, and their memory."""
-        memory = np.empty(self._ends[-1])
-        return self._bytes + ctypes.addressof(address(memory)), memory

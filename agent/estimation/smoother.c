@@ -5,6 +5,7 @@
    without fast math: results then follow from this text and from the functions of the C library alone. */
 
 #include <math.h>
+#include <stdlib.h>
 #include <string.h>
 
 #ifndef SOURCE
@@ -51,7 +52,7 @@ typedef long long Index;
 /* A function that is compiled for each of the sizes of BY_SIZE. */
 #define SIZED static inline __attribute__((always_inline))
 
-/* smoother.Measured: first the numbers, then the arrays. */
+/* smoother.Measured: first the numbers, then the arrays, which `prepared` finds. */
 typedef struct {
     Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed, strays;
     double period, survey, slow, decay, scale;
@@ -200,7 +201,8 @@ static void velocity_of(const Measured *of, const Walk *walk, Index i, Index k, 
     by[1] = v * sin(course);
 }
 
-void walked(const Measured *of, const double *poses, const double *constants, const double *white, Walk *to)
+static void walked(
+    const Measured *of, const double *poses, const double *constants, const double *white, Walk *to)
 {
     const Index K = of->ticks, m = of->constant;
     for (Index i = 0; i < of->robots; i++) {
@@ -677,16 +679,16 @@ SIZED int sized_step(
     }                                                                                      \
     return call;
 
-int loosened(
+static int loosened(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, Work *w, double *found)
 {
     BY_SIZE(of, sized_loosened(of, walk, poses, variance, w, found))
 }
 
-/* smoother.step; glibc has a function of that name, which would be called in its place. Returns 0 if the
-   information of the unknowns is not positive definite. */
-int gauss_newton_step(const Measured *of, const Walk *walk, const double *poses, const double *variance,
-                      double ridge, double largest, Work *w, Step *to)
+/* smoother.step. Returns 0 if the information of the unknowns is not positive definite. */
+static int stepping(
+    const Measured *of, const Walk *walk, const double *poses, const double *variance, double ridge,
+    double largest, Work *w, Step *to)
 {
     BY_SIZE(of, sized_step(of, walk, poses, variance, ridge, largest, w, to))
 }
@@ -992,7 +994,7 @@ static double off_model(
 static int step_of(const Measured *of, const Weighing *by, const Point *at, Work *w, Fitted *to)
 {
     const double largest = LARGEST_STEP * by->longest;
-    return gauss_newton_step(of, &at->walk, at->poses, to->variance, RIDGE, largest, w, &to->step)
+    return stepping(of, &at->walk, at->poses, to->variance, RIDGE, largest, w, &to->step)
         && isfinite(to->step.numbers[0]);
 }
 
@@ -1016,7 +1018,8 @@ static void ended(
 
 /* The fit that begins at the poses and errors of the first of `points`; unless `weighed`, its weights follow
    from the residuals there. Returns 0 if it is singular. */
-int fitted(const Measured *told, const Weighing *by, const Convergence *until, int weighed, Work *w, Fitted *to)
+static int converged(
+    const Measured *told, const Weighing *by, const Convergence *until, int weighed, Work *w, Fitted *to)
 {
     const Index ticks = told->strays * told->robots * told->ticks;
     Measured by_sound;
@@ -1074,7 +1077,7 @@ int fitted(const Measured *told, const Weighing *by, const Convergence *until, i
 }
 
 /* The fit after full steps from the first of `points`, with the weights there. Returns 0 if it is singular. */
-int held(const Measured *told, const Weighing *by, Index steps, Work *w, Fitted *to)
+static int holding(const Measured *told, const Weighing *by, Index steps, Work *w, Fitted *to)
 {
     Measured by_sound;
     const Measured *of = &by_sound;
@@ -1104,4 +1107,113 @@ int held(const Measured *told, const Weighing *by, Index steps, Work *w, Fitted 
     }
     ended(of, by, at, at, to->step.numbers[1], w, to);
     return 1;
+}
+
+/* --- the memory --------------------------------------------------------------------------------------- */
+
+#define POINT 13
+#define STEP 12
+#define ARRAYS (2 * POINT + STEP + 4)
+
+/* Let consecutive pointers from `to` on have parts of `memory`; returns its end. */
+static double *placed(double **to, double *memory, const Index *sizes, int count)
+{
+    for (int i = 0; i < count; i++) to[i] = memory, memory += sizes[i];
+    return memory;
+}
+
+/* Set the sizes of the arrays of a fit, in their order; returns how many elements all have. */
+static Index sizes_of(const Measured *of, Index sizes[ARRAYS])
+{
+    const Index n = of->robots, n3 = 3 * n, K = of->ticks, N = of->ranges, c = of->common;
+    const Index size = estimated(of), ticks = of->strays * n * K;
+    const Index point[POINT] = {
+        n3, c, n * of->constant, 2 * n * K, N, N, n3 * (K + 1), 8 * n * K, 2 * N, N, N, N, 1};
+    const Index rest[] = {
+        size, size, size * size, 2 * n * K, N, N, N, N, N, n3 * n3, 5 * ticks, 4, N, N, ticks, 6};
+    memcpy(sizes, point, sizeof point);
+    memcpy(sizes + POINT, point, sizeof point);
+    memcpy(sizes + 2 * POINT, rest, sizeof rest);
+    Index all = 0;
+    for (int i = 0; i < ARRAYS; i++) all += sizes[i];
+    return all;
+}
+
+/* Set the workspace; returns its memory, which the caller frees. */
+static double *workspace(const Measured *of, Work *to)
+{
+    const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of), size = estimated(of), N = of->ranges;
+    const Index longest = q > of->radios ? q : of->radios, ticks = of->strays * of->robots * of->ticks;
+    const Index sizes[] = {
+        N, N, N * q, N * s, s, s * q, s * s, q * q, q, s, s * size, s * s, s, size, size * size, size * size,
+        longest, longest, N, N, N, N, n3, ticks, 2 * ticks};
+    const int count = sizeof sizes / sizeof *sizes;
+    Index all = 0;
+    for (int i = 0; i < count; i++) all += sizes[i];
+    double *memory = malloc(sizeof(double) * (all + 1));
+    placed((double **)to, memory, sizes, count);
+    return memory;
+}
+
+/* Find the arrays of `of` and `by` in consecutive `floats` and `numbers`, and set the ends of those of a fit. */
+void prepared(Measured *of, Weighing *by, const double *floats, const Index *numbers, Index ends[ARRAYS])
+{
+    const Index n = of->robots, K = of->ticks, N = of->ranges, white = 2 * n * K;
+    const Index of_floats[] = {n * K, n * K, n * K, white, of->strays * white, of->constant * white, 2 * N, N,
+                               N * of->common, 3 * n, 9 * n * n, 2 * n};
+    const double **to = &of->v;
+    for (size_t i = 0; i < sizeof of_floats / sizeof *of_floats; i++) to[i] = floats, floats += of_floats[i];
+    by->sigma = floats;
+    of->begin = numbers;
+    of->first = of->begin + K + 2;
+    of->second = of->first + N;
+    of->anchor = of->second + N;
+    of->radio = of->anchor + N;
+    by->holding = of->radio + N;
+    by->by_radio = by->holding + N;
+    sizes_of(of, ends);
+    for (int i = 1; i < ARRAYS; i++) ends[i] += ends[i - 1];
+}
+
+/* The paths, in the order of Walk. */
+void paths(const Measured *of, const double *poses, const double *constants, const double *white, double *to)
+{
+    Index sizes[ARRAYS];
+    Walk walk;
+    sizes_of(of, sizes);
+    placed((double **)&walk, to, sizes + 6, 5);
+    walked(of, poses, constants, white, &walk);
+}
+
+/* A step; returns 0 if the information of the unknowns is not positive definite. */
+int gauss_newton_step(const Measured *of, double *walk, const double *poses, const double *variance,
+                      double ridge, double largest, double *memory)
+{
+    Index sizes[ARRAYS];
+    Walk from;
+    Step to;
+    Work w;
+    sizes_of(of, sizes);
+    placed((double **)&from, walk, sizes + 6, 5);
+    placed((double **)&to, memory, sizes + 2 * POINT, STEP);
+    double *space = workspace(of, &w);
+    const int found = stepping(of, &from, poses, variance, ridge, largest, &w, &to);
+    free(space);
+    return found;
+}
+
+/* The fit in `memory`, which has the start; until it has converged, or after a number of `steps` if a range holds a
+   coordinate. Returns 0 if it is singular. */
+int fitted(const Measured *of, const Weighing *by, const Convergence *until, int weighed, double *memory)
+{
+    Index sizes[ARRAYS];
+    Fitted to;
+    Work w;
+    sizes_of(of, sizes);
+    placed((double **)&to, memory, sizes, ARRAYS);
+    double *space = workspace(of, &w);
+    const int found = until->shortest < 0.0 ? holding(of, by, until->steps, &w, &to)
+                                            : converged(of, by, until, weighed, &w, &to);
+    free(space);
+    return found;
 }
