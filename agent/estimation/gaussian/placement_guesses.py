@@ -86,14 +86,6 @@ SHORTEST_LEVER = 0.03
 """The least lever that is assumed for a heading, as a fraction of R."""
 
 
-class Placed(NamedTuple):
-    """A candidate for the placement of both robots in <W>, by the mutual ranges."""
-
-    start: Start
-    log_likelihood: float
-    """The log-likelihood of the mutual ranges used, and of the offsets, up to a constant."""
-
-
 class Encounter(NamedTuple):
     """One robot at the encounter, from the ranges to its own anchor alone.
 
@@ -125,6 +117,34 @@ class Encounter(NamedTuple):
         more = attributed(model, rows, weights) + summed(constant, patterns)
         (begun,) = own.start.errors
         return anchor, (Errors(begun.v + more[0], begun.omega + more[1], begun.constant),)
+
+
+class Placed(NamedTuple):
+    """A candidate for the placement of both robots in <W>, by the mutual ranges."""
+
+    log_likelihood: float
+    """The log-likelihood of the mutual ranges used, and of the offsets, up to a constant."""
+    rotation: Array
+    """The rotations of both frames (rad); shape (2,)."""
+    offsets: Array
+    """The whitened offsets of both robots (see `Encounter`); shape (2, 3)."""
+    robots: tuple[Encounter, ...]
+    own: tuple[Fit, Fit]
+    """The fits of each robot to the ranges to its anchor."""
+    pivots: Array
+    """The places (m) of both anchors; shape (2, 2)."""
+
+    @property
+    def start(self) -> Start:
+        """The start of a fit to all ranges."""
+        poses, errors = np.empty((2, 3)), list[Errors]()
+        for i, (robot, own) in enumerate(zip(self.robots, self.own, strict=True)):
+            (mx, my), more = robot.begun(own, self.offsets[i])
+            turn, (at_x, at_y) = float(self.rotation[i]), self.pivots[i]
+            dx, dy = rotated(math.cos(turn), math.sin(turn), mx, my)
+            poses[i] = at_x - dx, at_y - dy, turn
+            errors += more
+        return Start(poses, tuple(errors))
 
 
 @lru_cache(maxsize=16)
@@ -182,18 +202,12 @@ def placements(own: tuple[Fit, Fit], pair: JointMeasurements) -> list[Placed]:
     between = (pair.pivots[1] - pair.pivots[0]).tolist()
     apart = (sign * between[0], sign * between[1])  # from the far robot's anchor to the near one's
     lever = np.array([max(radii[robot], SHORTEST_LEVER * pair.reach) for robot in (near, far)])
-    found = []
-    for one in _turned((robots[near], robots[far]), middle, rho, sigma, apart, lever, pair):
-        poses, errors = np.empty((2, 3)), []
-        for i, robot in enumerate((near, far)):
-            (mx, my), more = robots[robot].begun(own[robot], one[2 + 3 * i : 5 + 3 * i])
-            turn, (at_x, at_y) = float(one[i]), pair.pivots[robot]
-            dx, dy = rotated(math.cos(turn), math.sin(turn), mx, my)
-            poses[robot] = at_x - dx, at_y - dy, turn
-            errors.append(more)
-        in_order = errors if near == 0 else errors[::-1]
-        found.append(Placed(Start(poses, tuple([each for more in in_order for each in more])), float(one[8])))
-    return found
+    found = _turned((robots[near], robots[far]), middle, rho, sigma, apart, lever, pair)
+    offsets = found[:, 2:8].reshape(-1, 2, 3)
+    return [
+        Placed(float(one[8]), one[[near, far]], each[[near, far]], tuple(robots), own, pair.pivots)
+        for one, each in zip(found, offsets, strict=True)
+    ]
 
 
 def _circles(far: Encounter, i: int, rho: float, lever: float) -> Array:

@@ -339,13 +339,13 @@ def _of_pair(pair: JointMeasurements) -> tuple[Hypothesis, ...]:
     """
     of_a, of_b = (_until_now(pair, robot) for robot in (0, 1))
     found = [
-        (placed.log_likelihood + math.log(a.probability * b.probability), placed.start)
+        (placed.log_likelihood + math.log(a.probability * b.probability), placed)
         for a in of_a
         for b in of_b
         for placed in placements((a.fit, b.fit), pair)
     ]
     found.sort(key=lambda one: -one[0])
-    starts = [start for weight, start in found[:STARTS] if weight > found[0][0] - UNLIKELY]
+    starts = [placed.start for weight, placed in found[:STARTS] if weight > found[0][0] - UNLIKELY]
     return hypotheses_of(fits(pair, starts, doubted=STARTS_WITHOUT_OUTLIERS), pair)
 
 
