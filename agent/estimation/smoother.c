@@ -52,6 +52,13 @@ typedef long long Index;
 /* A function that is compiled for each of the sizes of BY_SIZE. */
 #define SIZED static inline __attribute__((always_inline))
 
+/* A function that is compiled for wider vectors, too; the same operations have the same results. */
+#if defined(__x86_64__) && defined(__GLIBC__) && !defined(__clang__)
+#define CLONED __attribute__((target_clones("avx2", "default")))
+#else
+#define CLONED
+#endif
+
 /* smoother.Measured: first the numbers, then the arrays, which `prepared` finds. */
 typedef struct {
     Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed, strays;
@@ -170,15 +177,21 @@ SIZED void solved(const double *lower, Index size, const double *right, double *
     }
 }
 
-SIZED void inverted(const double *lower, Index size, double *right, double *column, double *inverse)
+/* The inverse by `solved` for all columns at once. */
+SIZED void inverted(const double *lower, Index size, double *row, double *inverse)
 {
-    memset(right, 0, sizeof(double) * size);
-    for (Index e = 0; e < size; e++) {
-        right[e] = 1.0;
-        solved(lower, size, right, column);
-        right[e] = 0.0;
-        for (Index a = 0; a <= e; a++) inverse[a * size + e] = inverse[e * size + a] = column[a];
+    memset(inverse, 0, sizeof(double) * size * size);
+    for (Index a = 0; a < size; a++) {
+        memset(row, 0, sizeof(double) * size);
+        for (Index e = 0; e < a; e++) add(row, lower[a * size + e], inverse + e * size, size);
+        for (Index c = 0; c < size; c++) inverse[a * size + c] = ((c == a) - row[c]) / lower[a * size + a];
     }
+    for (Index a = size - 1; a >= 0; a--) {
+        for (Index c = 0; c < size; c++) row[c] = -(inverse[a * size + c] /= lower[a * size + a]);
+        for (Index e = 0; e < a; e++) add(inverse + e * size, lower[a * size + e], row, size);
+    }
+    for (Index a = 0; a < size; a++)
+        for (Index e = 0; e < a; e++) inverse[a * size + e] = inverse[e * size + a];
 }
 
 /* --- sizes ------------------------------------------------------------------------------------------ */
@@ -570,9 +583,9 @@ SIZED void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
             const double here = told_by(of, walk, j, w, to->alone + j);
             to->multipliers[j] = here - dot(w->effect, to->change, size);
             to->own[j] = here - dot(w->effect, to->limited, size);
-            to->explained[j] = 0.0;
-            for (Index a = 0; a < size; a++)
-                to->explained[j] += w->effect[a] * dot(to->inverse + a * size, w->effect, size);
+            memset(w->vector, 0, sizeof(double) * size);
+            for (Index a = 0; a < size; a++) add(w->vector, w->effect[a], to->inverse + a * size, size);
+            to->explained[j] = dot(w->effect, w->vector, size);
         }
         if (k == 0) break;
         for (Index i = 0; i < of->robots; i++) {
@@ -642,7 +655,7 @@ SIZED int sized_step(
     }
     if (!cholesky(w->information, q, 0, size, w->lower)) return 0;
     solved(w->lower, size, w->gradient, to->change);
-    inverted(w->lower, size, w->vector, w->other, to->inverse);
+    inverted(w->lower, size, w->vector, to->inverse);
     if (!cholesky(to->inverse, size, 0, n3, w->inner)) return 0;
     substituted(w->inner, n3, to->change, w->vector);
     const double length = sqrt(dot(w->vector, w->vector, n3));
@@ -662,31 +675,30 @@ SIZED int sized_step(
     return 1;
 }
 
-/* Return what `call` returns with `of`, compiled once more for the sizes that most fits of missions have: a robot,
-   or two, without further errors. */
-#define BY_SIZE(of, call)                                                                  \
-    const int plain = !(of->common || of->constant || of->anchors || of->radios);          \
-    Measured sized = *of;                                                                  \
-    of = &sized;                                                                           \
-    if (plain) sized.common = sized.constant = sized.anchors = sized.radios = 0;           \
-    if (plain && sized.robots == 2) {                                                      \
-        sized.robots = 2;                                                                  \
-        return call;                                                                       \
-    }                                                                                      \
-    if (plain && sized.robots == 1) {                                                      \
-        sized.robots = 1;                                                                  \
-        return call;                                                                       \
-    }                                                                                      \
+/* Return what `call` returns with `of`, compiled once more for the sizes that most fits of missions have: a robot
+   near its anchor, or two, with a bias and a scale of all ranges, a bias of each pair of radios, and the errors of
+   the odometry. */
+#define BY_SIZE(of, call)                                                                                   \
+    Measured sized = *of;                                                                                   \
+    of = &sized;                                                                                            \
+    if (sized.constant == 3 && !sized.anchors && !sized.radios && sized.robots == 2 && sized.common == 5) { \
+        sized.robots = 2, sized.common = 5, sized.constant = 3, sized.anchors = sized.radios = 0;           \
+        return call;                                                                                        \
+    }                                                                                                       \
+    if (sized.constant == 3 && !sized.anchors && !sized.radios && sized.robots == 1 && sized.common == 3) { \
+        sized.robots = 1, sized.common = 3, sized.constant = 3, sized.anchors = sized.radios = 0;           \
+        return call;                                                                                        \
+    }                                                                                                       \
     return call;
 
-static int loosened(
+CLONED static int loosened(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, Work *w, double *found)
 {
     BY_SIZE(of, sized_loosened(of, walk, poses, variance, w, found))
 }
 
 /* smoother.step. Returns 0 if the information of the unknowns is not positive definite. */
-static int stepping(
+CLONED static int stepping(
     const Measured *of, const Walk *walk, const double *poses, const double *variance, double ridge,
     double largest, Work *w, Step *to)
 {
