@@ -50,7 +50,7 @@ SIGNATURES = {
     "eigen": (None, "naa"),
     "anchor_guesses": (TYPES["n"], "naaaaanaannadddna"),
     "no_detection": (TYPES["d"], "naddn"),
-    "detections": (TYPES["d"], "anndnannaaadan"),
+    "detections": (TYPES["d"], "anaannaaadan"),
     "same_poses": (None, "naaadda"),
     "placements": (TYPES["n"], "nnaaaaaaaaaaanannaaddndddna"),
 }

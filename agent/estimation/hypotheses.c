@@ -474,11 +474,10 @@ double no_detection(Index count, double *beyond, double sigma, double drop_outs,
 }
 
 /* The log-likelihood of a detection (`sign` -1) or of none (1) at each of the ticks, between the robot `first` and
-   the robot `second`, or the anchor at its pivot if that is -1. Those of a fit: `paths` have `points` poses each,
-   `poses` are those at tick 0, and `level` times `inverse` is their covariance, with rows of `width` elements. */
-double detections(const Detection *by, Index first, Index second, double sign, Index count, const Index *ticks,
-                  Index robots, Index points, const double *paths, const double *poses, const double *pivot,
-                  double level, const double *inverse, Index width)
+   the robot `second`, or the anchor at its pivot if that is -1; for the others, see `detections`. */
+static double seen(const Detection *by, Index first, Index second, double sign, Index count, const Index *ticks,
+                   Index robots, Index points, const double *paths, const double *poses, const double *pivot,
+                   double level, const double *inverse, Index width)
 {
     const Index size = second < 0 ? 2 : 3 * robots, begin = second < 0 ? 3 * first : 0;
     double *beyond = malloc(sizeof *beyond * (count + 2 * size)), *gradient = beyond + count, *terms = gradient + size;
@@ -516,6 +515,24 @@ double detections(const Detection *by, Index first, Index second, double sign, I
     }
     free(beyond);
     return weight;
+}
+
+/* The log-likelihood of all `terms`: each is a first robot, a second one or -1, the sign, and the number of its ticks.
+   Those of a fit: `paths` have `points` poses each, `poses` are those at tick 0, and `level` times `inverse` is their
+   covariance, with rows of `width` elements. */
+double detections(const Detection *by, Index count, const Index *terms, const Index *ticks, Index robots, Index points,
+                  const double *paths, const double *poses, const double *pivot, double level, const double *inverse,
+                  Index width)
+{
+    double total = 0.0, between = 0.0;
+    for (Index t = 0; t < count; t++, ticks += terms[3], terms += 4) {
+        between += seen(by, terms[0], terms[1], (double)terms[2], terms[3], ticks, robots, points, paths, poses, pivot,
+                        level, inverse, width);
+        if (t + 1 < count && terms[4] == terms[0] && terms[5] == terms[1]) continue;
+        total += between;
+        between = 0.0;
+    }
+    return total;
 }
 
 /* --- the same poses -------------------------------------------------------------------------------------- */

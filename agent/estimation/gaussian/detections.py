@@ -20,23 +20,21 @@ def detection_log_likelihoods(found: Sequence[Fit], measured: JointMeasurements)
     """
     if not measured.silent:
         return [0.0] * len(found)
-    numbers = (measured.reach, CLEAR, EDGE, measured.noise.drop_outs)
-    by, ranges, ticks = address(np.array((*numbers, SILENT))), measured.ranges, []
+    by = address(np.array((measured.reach, CLEAR, EDGE, measured.noise.drop_outs, SILENT)))
+    terms, ticks, ranges = [], [], measured.ranges
     for first, second, silent in measured.silent:
-        own = [(1.0, len(silent), address(silent))]
+        terms.append((first, second, 1, len(silent)))
+        ticks.append(silent)
         if second < 0:
-            ranged = ranges.tick[ranges.to_anchors(first)]
-            own.append((-1.0, len(ranged), address(ranged)))
-        ticks.append((first, second, own))
+            ticks.append(ranges.tick[ranges.to_anchors(first)])
+            terms.append((first, second, -1, len(ticks[-1])))
+    given = (by, len(terms), address(np.array(terms)), address(np.concatenate(ticks)))
     weights = []
     for one in found:
-        of, step, robots = one.problem.measured, one.linear.step, len(one.paths)
-        at = [address(part) for part in (one.paths, one.start.poses, of.pivot)]
-        fit = (robots, one.paths.shape[1], *at, one.level, address(step.inverse), len(step.inverse))
-        weight = 0.0
-        for first, second, own in ticks:
-            weight += sum([library().detections(by, first, second, *some, *fit) for some in own])
-        weights.append(weight)
+        pivot, inverse = one.problem.measured.pivot, one.linear.step.inverse
+        at = [address(part) for part in (one.paths, one.start.poses, pivot)]
+        fit = (len(one.paths), one.paths.shape[1], *at, one.level, address(inverse), len(inverse))
+        weights.append(library().detections(*given, *fit))
     return weights
 
 

@@ -84,17 +84,18 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         multiplies the measured ranges: then the effects are the same under each guess. The column of the
         delay is in s: its effect is minus the range rate (see `smoother`).
         """
-        rho = self.rho
-        columns: list[Array] = []
+        rho, radios = self.rho, sorted(set(self.radio.tolist()) - {-1}) if priors.pair_bias else []
+        size = bool(priors.range_bias) + bool(priors.range_scale) + len(radios) + bool(priors.range_delay)
+        found, column = np.empty((len(rho), size)), 0
         if priors.range_bias:
-            columns.append(np.full(len(rho), priors.range_bias))
+            found[:, column], column = priors.range_bias, column + 1
         if priors.range_scale:
-            columns.append(priors.range_scale * rho)
-        if priors.pair_bias:
-            columns += [np.where(own, priors.pair_bias, 0.0) for own in self.pairs]
+            found[:, column], column = priors.range_scale * rho, column + 1
+        if radios:
+            found[:, column : column + len(radios)] = priors.pair_bias * (self.radio[:, None] == radios)
         if priors.range_delay:
-            columns.append(np.full(len(rho), priors.range_delay))
-        return np.array(columns).T if columns else np.zeros((len(rho), 0))
+            found[:, -1] = priors.range_delay
+        return found
 
     def rows(self, some: NDArray[np.bool] | Places) -> JointRanges:
         """Return the ranges selected by `some`."""
@@ -270,8 +271,9 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         ranges, found = self.ranges, np.full((len(self.robots), 2), math.nan)
         of_anchors = (ranges.second < 0) & (ranges.radio >= 0)
         for i in range(len(found)):
-            places = set(zip(*ranges.place[of_anchors & (ranges.first == i)].T.tolist(), strict=True))
-            if places:
+            rows = ranges.place[of_anchors & (ranges.first == i)]
+            places = {tuple(row) for row in rows.tolist()} if (rows[1:] != rows[:-1]).any() else rows[:1]
+            if len(places):
                 found[i] = [math.fsum(axis) / len(places) for axis in zip(*places, strict=True)]
         return found
 
@@ -289,10 +291,10 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         Of each pair of radios they are all recent ones and some older ones, so that the cost of a tick is
         bounded. `reach` is the longest range (m) that is expected.
         """
-        possible = self.ranges.rho <= reach + IMPOSSIBLE * np.sqrt(
-            np.square(self.ranges.sigma) + self.loosened
-        )
-        ranges = self.ranges if possible.all() else self.ranges.rows(possible)
+        ranges = self.ranges
+        if ranges.rho.max(initial=0.0) > reach:
+            most = reach + IMPOSSIBLE * np.sqrt(np.square(ranges.sigma) + self.loosened)
+            ranges = ranges.rows(ranges.rho <= most)
         return msgspec.structs.replace(self, ranges=ranges, reach=reach).thinned_after()
 
     def thinned_after(self, tick: int = -1, most: int | None = None) -> JointMeasurements:

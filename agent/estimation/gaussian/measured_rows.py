@@ -50,14 +50,16 @@ def near_anchors(
     lists, robots = [*own, mutual], len(paths)
     counts = [len(one) for one in lists]
     kind = np.repeat(np.arange(robots + 1), counts)
-    sigmas = [noise.anchor_sigma] * robots + [noise.mutual_sigma]
+    sigmas = np.array(
+        [max(noise.anchor_sigma, SIGMA_FLOOR)] * robots + [max(noise.mutual_sigma, SIGMA_FLOOR)]
+    )
     ranges = JointRanges(
         np.array([rho for ranges in lists for _, rho in ranges], np.float64),
         np.array([tick for ranges in lists for tick, _ in ranges], np.intp),
-        np.repeat([max(sigma, SIGMA_FLOOR) for sigma in sigmas], counts),
+        sigmas[kind],
         kind % robots,
         np.where(kind == robots, 1, -1),
-        np.repeat(np.array([*places, (0.0, 0.0)]), counts, 0),
+        np.array([*places, (0.0, 0.0)])[kind],
         kind,
     )
     return JointMeasurements(
