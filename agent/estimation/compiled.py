@@ -49,6 +49,7 @@ SIGNATURES = {
     "solutions": (ctypes.c_int, "nnnaa"),
     "eigen": (None, "naa"),
     "anchor_guesses": (TYPES["n"], "naaaaanaannadddna"),
+    "tracked": (None, "nndaaaaaa"),
     "no_detection": (TYPES["d"], "naddn"),
     "detections": (TYPES["d"], "anaannaaadan"),
     "same_poses": (None, "naaadda"),

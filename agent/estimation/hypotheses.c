@@ -1,5 +1,5 @@
-/* The initial guesses of anchor_guesses.py and placement_guesses.py, the likelihood of detections.py, and
-   `same` of posterior.py. These explain them, and have the constants.
+/* `track` of odometry_noise.py, the initial guesses of anchor_guesses.py and placement_guesses.py, the likelihood of
+   detections.py, and `same` of posterior.py. These explain them, and have the constants.
 
    Sums over ranges are those of numpy (`summed`), so that the results are the same to the bit. */
 
@@ -8,6 +8,9 @@
 #include <string.h>
 
 typedef long long Index;
+
+/* A function that is compiled for each number of unknowns. */
+#define SIZED static inline __attribute__((always_inline))
 
 int solutions(Index count, Index size, Index columns, double *matrix, double *right);
 void eigen(Index size, double *matrix, double *vectors);
@@ -66,6 +69,31 @@ static double summed(const double *values, Index count)
     total = ((part[0] + part[1]) + (part[2] + part[3])) + ((part[4] + part[5]) + (part[6] + part[7]));
     for (; j < count; j++) total += values[j];
     return total;
+}
+
+/* --- paths ---------------------------------------------------------------------------------------------- */
+
+#define NO_TURN 1e-20
+
+/* Set the x and y, the headings and the displacements per unit of v of `paths`; `slip` may be NULL. */
+void tracked(Index paths, Index ticks, double period, const double *v, const double *omega, const double *slip,
+             double *place, double *heading, double *shift)
+{
+    for (Index path = 0; path < paths; path++, v += ticks, omega += ticks, shift += 2 * ticks) {
+        double *x = place + 2 * path * (ticks + 1), *y = x + ticks + 1;
+        x[0] = y[0] = heading[0] = 0.0;
+        for (Index k = 0; k < ticks; k++) {
+            const double half = (0.5 * period) * omega[k], turn = half == 0.0 ? NO_TURN : half;
+            const double course = slip ? heading[k] + half + *slip++ : heading[k] + half;
+            const double unit = period * (sin(turn) / turn);
+            shift[k] = unit * cos(course);
+            shift[ticks + k] = unit * sin(course);
+            heading[k + 1] = heading[k] + period * omega[k];
+            x[k + 1] = x[k] + v[k] * shift[k];
+            y[k + 1] = y[k] + v[k] * shift[ticks + k];
+        }
+        heading += ticks + 1;
+    }
 }
 
 /* --- the densities of ranges ------------------------------------------------------------------------- */
@@ -233,7 +261,7 @@ typedef struct {
 
 /* Set the vector (m) between the robots at the middle range, and the residuals (m) of `z` with their derivatives
    by its first `unknowns`: 0, 2 (rotations) or 8. */
-static void residuals_at(
+SIZED void residuals_at(
     const Meeting *of, Index unknowns, const double *z, double *gap, double *residuals, double *jacobian)
 {
     double x[2], y[2], c[2], s[2], offset[2][3] = {{0.0}};
@@ -283,7 +311,7 @@ static double likelihood_of(const Meeting *of, const Spread *spread, const doubl
 }
 
 /* Move `z` by a step of Gauss-Newton on its first `unknowns`. Returns 0 if a matrix is singular. */
-static int turn(const Meeting *of, const Spread *spread, Index unknowns, double damping, double most, double *z,
+SIZED int turn(const Meeting *of, const Spread *spread, Index unknowns, double damping, double most, double *z,
                 double *work)
 {
     double *residuals = work, *jacobian = work + of->count, gap[2];
@@ -418,10 +446,12 @@ Index placements(Index count, Index middle, const double *near_x, const double *
     for (Index k = 0; k < circles; k++) end = scanned(&of, circle + k, end);
     Index left = end - all;
     for (Index step = 0; step < steps; step++) {
-        const Index unknowns = left <= crowd ? UNKNOWNS : 2; /* of many candidates, only the rotations */
+        const int crowded = left > crowd; /* of many candidates, only the rotations */
         widen(&spread, sigma, finer[step]);
         for (Index n = 0; n < left; n++)
-            if (!turn(&of, &spread, unknowns, damping[step], largest, all[n].z, work)) steps = -1, left = 0;
+            if (!(crowded ? turn(&of, &spread, 2, damping[step], largest, all[n].z, work)
+                          : turn(&of, &spread, UNKNOWNS, damping[step], largest, all[n].z, work)))
+                steps = -1, left = 0;
         if (left <= crowd) continue;
         widen(&spread, sigma, finer[step + 1]);
         left = thinned(&of, cell, crowd, sorted(&of, &spread, unlikely, left, all, work), all);

@@ -16,7 +16,8 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.estimation.elementary import cos, sin, tan
+from agent.estimation.compiled import address, library
+from agent.estimation.elementary import sin, tan
 from agent.estimation.smoother import SLIGHT
 from protocol.noise import Noise, VelocityNoise
 
@@ -84,16 +85,13 @@ class Track(NamedTuple):
 
 def track(v: Array, omega: Array, period: float, slip: Array | None = None) -> Track:
     """Return the path from dead reckoning with eq. (1a), and with lateral `slip`, from the origin."""
-    heading = _summed(period * omega)
-    half = (0.5 * period) * omega
-    course = heading[..., :-1] + half
-    if slip is not None:
-        course += slip
-    unit = period * ratio_of_chord(half)
-    shift = np.empty((*v.shape[:-1], 2, v.shape[-1]))
-    np.multiply(unit, cos(course), out=shift[..., 0, :])
-    np.multiply(unit, sin(course), out=shift[..., 1, :])
-    return Track(v, omega, period, _summed(v[..., None, :] * shift), heading, shift, slip)
+    leading, ticks = v.shape[:-1], v.shape[-1]
+    place, heading = np.empty((*leading, 2, ticks + 1)), np.empty((*leading, ticks + 1))
+    shift = np.empty((*leading, 2, ticks))
+    measured = [one if one is None else np.ascontiguousarray(one, np.float64) for one in (v, omega, slip)]
+    given = [one if one is None else address(one) for one in (*measured, place, heading, shift)]
+    library().tracked(math.prod(leading), ticks, period, *given)
+    return Track(v, omega, period, place, heading, shift, slip)
 
 
 def ratio_of_chord(half: Array) -> Array:
