@@ -130,8 +130,10 @@ static double smaller(double one, double other) { return other < one ? other : o
 
 /* --- linear algebra --------------------------------------------------------------------------------- */
 
+/* Teams with an exact odometry, and ranges that concern two robots of many, have mostly factors of 0. */
 SIZED void add(double *restrict to, double factor, const double *restrict what, Index count)
 {
+    if (factor == 0.0) return;
     for (Index e = 0; e < count; e++) to[e] += factor * what[e];
 }
 
@@ -505,7 +507,10 @@ SIZED double told_by(const Measured *of, const Walk *walk, Index j, Work *w, dou
     double *effect = w->effect, *weighted = w->weighted;
     for (Index e = 0; e < size; e++) effect[e] = w->effects[j * q + e] / spread;
     for (Index a = 0; a < s; a++) add(effect, -gain[a], w->by_unknowns + a * size, size);
-    for (Index a = 0; a < s; a++) weighted[a] = dot(w->weight + a * s, gain, s);
+    memset(weighted, 0, sizeof(double) * s);
+    for (Index e = 0; e < s; e++)
+        if (gain[e] != 0.0)
+            for (Index a = 0; a < s; a++) weighted[a] += w->weight[a * s + e] * gain[e];
     *precision = 1.0 / spread + dot(gain, weighted, s);
     const Row row = row_of(of, walk, j);
     for (int t = 0; t < row.count; t++) {

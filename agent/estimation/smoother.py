@@ -648,7 +648,7 @@ def zeros(rows: int, columns: int) -> Matrix:
 
 def add(to: Vector, factor: float, what: Vector) -> None:
     """Add a multiple of `what` to the first elements of `to`."""
-    for e in range(len(what)):
+    for e in range(len(what) if factor else 0):
         to[e] += factor * what[e]
 
 
