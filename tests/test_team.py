@@ -8,13 +8,18 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import tandem
+from agent.estimation.facts import Facts
 from agent.estimation.gaussian.claim_agreement import united
+from agent.estimation.gaussian.measured_rows import joint_measurements
+from agent.estimation.gaussian.search import search
+from agent.estimation.posterior import carried
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
 from agent.planning.team import TeamPlanner
@@ -39,6 +44,7 @@ from protocol.team_motion import spiral
 from protocol.wire import decode, encode
 from tests.commands import journals
 from tests.commands import tandem as tandem_command
+from tests.moving_groups import PERIOD_S, moving_group
 from tests.series import series
 from tests.test_audit import kept
 from world.hardware.driver import Reading
@@ -148,6 +154,37 @@ def test_an_anchor_with_three_ranges_from_one_line_is_not_said_to_stand_at_their
     room = MISSION.replace("5.0", "3.0") + "[team]\nrobots = 2\nanchors = 5\nside = 10.0"
     run = run_mission(replace(parse(f'name = "line"\nseed = 1021\n{room}', "line"), max_ticks=8))
     assert run.standing_claim("r1") is not None
+
+
+def test_hypotheses_stay_those_of_their_robots_when_another_one_gets_its_first_range() -> None:
+    """Then the indices of all robots change that come after it by name, and the origin may."""
+    group = moving_group(3, 1, ticks=12)
+    known = {key for key, _ in group.facts.known}
+    late = {key for key in known if "r00" in (key.robot, key.other) or key.robot == "Mr00"}
+    facts = Facts(frozenset([one for one in group.facts.known if one[0] not in late]))
+    before, now = (joint_measurements(one, group.noise, PERIOD_S, 30.0) for one in (facts, group.facts))
+    assert (before.robots, now.robots) == (("r01", "r02"), ("r00", "r01", "r02"))
+    assert before.origin != now.origin
+    found = search(before)
+    after = carried(found, before, now)
+    assert (found.located, after.located) == ((0, 1), (1, 2))
+    for one, other in zip(found.hypotheses, after.hypotheses, strict=True):
+        moved = other.fit.start.poses[:, :2] + now.origin
+        assert np.allclose(moved, one.fit.start.poses[:, :2] + before.origin, atol=1e-12)
+    room = MISSION.replace("5.0", "3.0") + "[team]\nrobots = 4\nanchors = 5\nside = 10.0"
+    run = run_mission(replace(parse(f'name = "late"\nseed = 1019\n{room}', "late"), max_ticks=12))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+
+
+def test_an_anchor_with_a_sigma_that_is_ranged_for_the_first_time_ends_no_robot() -> None:
+    places = [(9.0, 9.0), (0.5, 0.0), (6.0, 0.0), (0.0, 6.0), (3.0, 4.0)]
+    anchors = [f'[[anchor]]\nid = "A{k}"\nposition = {[*at]}\nsigma = 0.05\n' for k, at in enumerate(places)]
+    run = run_mission(team(ALONE + '\n[[robot]]\nid = "b"\nstart = [6.0, 6.0, 0.5]', "".join(anchors)))
+    ranged = [{near.anchor for one in seen.values() for near in one.anchors} for seen in run.observations]
+    assert not ranged[-1] <= ranged[0]
+    assert run.end is not None
+    assert run.end.outcome == "localised"
 
 
 APART = '[[robot]]\nid = "a"\nstart = [1.0, 1.0, 0.5]\n[[robot]]\nid = "b"\nstart = [9.0, 7.0, 2.0]'

@@ -15,7 +15,7 @@ from agent.estimation.gaussian.joint_claims import Displacement, displaced_ancho
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import begun, candidates, extended, search
 from agent.estimation.judged import Judged, User, misfit, of_joint
-from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, ended, settled
+from agent.estimation.posterior import NO_HYPOTHESES, Posterior, carried, certainties, ended, settled
 
 GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
 """The numbers of ranges at which the whole plane is searched again."""
@@ -78,7 +78,7 @@ class Following(NamedTuple):
     """The number of ranges at the latest search of the whole plane."""
     searches: int = 0
     """The number of searches."""
-    failed: Mapping[tuple[int, ...], int] = {}
+    failed: Mapping[tuple[str, ...], int] = {}
     """The decisive ranges with which robots were not located."""
     claimed: frozenset[str] = frozenset()
     """The robots that might have claimed their poses."""
@@ -102,7 +102,8 @@ class Following(NamedTuple):
             rule = rule._replace(accuracy=EXACT_ACCURACY)
         if user == "team" and self._contradicted and count >= MORE_RANGES * self.begun_again:
             self = Following(claimed=self.claimed, begun_again=count)  # noqa: PLW0642  # as if it were new
-        known = ended(settled(self.known, used), used)
+        known = carried(self.known, self.part, used) if self.part is not None else self.known
+        known = ended(settled(known, used), used)
         now = self._extended(known if known.hypotheses else begun(used), used)
         due = now.known.hypotheses and any(self.searched < at <= count for at in GROUP_SEARCHES)
         now = now._tested(used, rule, user, asked)
@@ -128,14 +129,15 @@ class Following(NamedTuple):
 
     def _extended(self, found: Posterior, used: JointMeasurements) -> Following:
         """Return `found` with further robots; those that failed are tried again with more ranges."""
-        possible = candidates(found.located, used)
-        left = [one for one in possible if one.decisive < MORE_RANGES * self.failed.get(one.robots, 0)]
+        names, possible = used.robots, candidates(found.located, used)
+        tried = {one: self.failed.get(tuple([names[k] for k in one.robots]), 0) for one in possible}
+        left = [one for one in possible if one.decisive < MORE_RANGES * tried[one]]
         if len(left) == len(possible):
             return self._replace(known=found)
         more, failed = extended(found, used, left), dict(self.failed)
         for one in candidates(more.located, used):
             if one not in left:
-                failed[one.robots] = one.decisive
+                failed[tuple([names[k] for k in one.robots])] = one.decisive
         return self._replace(known=more, failed=failed)
 
     def _tested(

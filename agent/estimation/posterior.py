@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.compiled import address, library
-from agent.estimation.fit import TO_THE_END, Fit, fits
+from agent.estimation.fit import TO_THE_END, Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.detections import detection_log_likelihoods
@@ -144,6 +144,26 @@ NO_VARIANCE = 1e-15
 
 
 # --- from tick to tick --------------------------------------------------------------------------------
+
+
+def carried(known: Posterior, before: JointMeasurements, now: JointMeasurements) -> Posterior:
+    """Return the hypotheses `known`, which are fits to `before`, with the indices and the origin of `now`.
+
+    A robot or an anchor that gets its first range changes the indices of others, and may change the origin.
+    """
+    names, count, index = before.robots, len(known.located), {name: k for k, name in enumerate(now.robots)}
+    located = tuple([index[name] for name in names[:count]])
+    of_all, origin = (*names[:count], *[now.robots[k] for k in now.placed]), now.origin
+    if not known.hypotheses or (names, before.origin) == (of_all, origin):
+        return Posterior(located, known.hypotheses)
+    told = {} if now.prior is None else dict(zip(now.robots, now.prior.mean, strict=True))
+    shift, hypotheses = (before.origin[0] - origin[0], before.origin[1] - origin[1], 0.0), []
+    for one in known.hypotheses:
+        start = one.fit.start
+        poses = {**told, **dict(zip(names, start.poses + shift, strict=True))}
+        moved = Start(np.array([poses[name] for name in of_all]), start.errors[:count])
+        hypotheses.append(one._replace(fit=one.fit._replace(start=moved)))
+    return Posterior(located, tuple(hypotheses))
 
 
 @lru_cache(maxsize=8)
