@@ -35,6 +35,7 @@ from agent.estimation.posterior import (
     merged,
     same,
 )
+from agent.estimation.problem import Problem
 
 FEWEST_DECISIVE = 3
 """The least number of decisive ranges with which a robot or a pair is located, and of ranges to each anchor.
@@ -62,6 +63,12 @@ FOLLOWED_RANGES = 6
 
 Two circles have two intersections, so a few ranges from different places leave nothing that a search would
 find. With outliers it takes SEED_RANGES."""
+
+OFF_IMAGE = 0.3
+"""The RMS of its ranges, as a fraction of the longest one, beyond which an image is none of a hypothesis.
+
+Robots that have turned have none; a fit from there takes all its steps, and mostly leads back.
+"""
 
 COARSE_STILL = 0.05
 """The `Convergence.shortest` of fits on which only the robot's way depends.
@@ -239,8 +246,17 @@ def _with_images(found: tuple[Hypothesis, ...], part: JointMeasurements) -> tupl
             poses[others] = np.stack(
                 (c * x + s * y + 2.0 * foot[0], s * x - c * y + 2.0 * foot[1], 2.0 * course - heading), 1
             )
-            starts.append(Start(poses))
+            starts += (
+                [Start(poses)] if _off(poses, part) <= OFF_IMAGE * float(np.max(part.ranges.rho)) else []
+            )
     return _with_more(found, starts, part)
+
+
+def _off(poses: Array, part: JointMeasurements) -> float:
+    """Return the root mean square (m) of what ranges are off from start `poses` by the measured odometry."""
+    of = (problem := Problem.of(part)).measured
+    found = problem.kernel.walked(poses.ravel(), np.zeros(of.patterns.shape[:2]), np.zeros(of.white.shape))
+    return float(np.sqrt(np.mean(np.square(found.residual))))
 
 
 def _with_more(
