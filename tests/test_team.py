@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -148,6 +149,18 @@ def test_a_claim_says_across_which_line_of_anchors_no_range_tells_where_they_sta
     (tmp_path / "line.toml").write_text(f'name = "line"\nseed = 1\n{EXACT}{IN_A_LINE}{ALONE}')
     said = tandem_command("run", tmp_path / "line.toml", "--in-process")
     assert "no range tells whether A1, A2 stand elsewhere than told" in said.out
+
+
+def test_a_robot_gives_up_if_twice_as_many_ranges_still_blame_one_of_two_anchors() -> None:
+    """Only their distance is wrong, so both are named; more ranges would say the same for 1 009 ticks."""
+    survey = file_table(load("survey"))
+    survey["anchor"][0]["stands"] = [0.212, 0.212]
+    run = run_mission(template_of(survey).scenario)
+    assert run.end is not None
+    assert run.end.outcome == "undecided"
+    assert run.end.tick < 60
+    (blamed,) = [one.text or "" for one in run.end.causes if "stand elsewhere" in (one.text or "")]
+    assert {"A1", "A2"} == set(re.findall("A[0-9]", blamed))
 
 
 def test_an_anchor_with_three_ranges_from_one_line_is_not_said_to_stand_at_their_mirror_image() -> None:

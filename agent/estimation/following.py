@@ -38,6 +38,9 @@ RETESTED = 1.1
 With less, claims of robots with many anchors take twice as long; with more, a false place is found later.
 """
 
+CONFIRMED = 2.0
+"""The factor by which ranges must have grown, and blamed an anchor all the time, before a robot gives up."""
+
 MORE_RANGES = 1.5
 """The factor by which the decisive ranges of a robot must have grown before it is tried again."""
 
@@ -86,6 +89,8 @@ class Following(NamedTuple):
     """How far each anchor seems to stand elsewhere, at the latest test."""
     tested: int = 0
     """The number of ranges at that test."""
+    doubted: int = 0
+    """The number of ranges since which all tests have found such an anchor; 0 if the latest has not."""
     begun_again: int = 0
     """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
 
@@ -115,6 +120,11 @@ class Following(NamedTuple):
             now = now._replace(known=found, searched=count, searches=self.searches + 1)
             now = now._tested(used, rule, user, asked)
         return now._replace(claimed=self.claimed | now._claiming)
+
+    @property
+    def displacement_confirmed(self) -> bool:
+        """True if more ranges go on to say that an anchor stands elsewhere."""
+        return 0 < CONFIRMED * self.doubted <= self.tested
 
     @property
     def _claiming(self) -> frozenset[str]:
@@ -153,12 +163,15 @@ class Following(NamedTuple):
         }
         first = {name: blocked(one, BEFORE_SEARCH) for name, one in judged.items()}
         claiming = {name for name, one in first.items() if one is None or one.condition in DISPLACED}
-        shifts, tested = self.displacements, self.tested
+        shifts, tested, doubted = self.displacements, self.tested, self.doubted if claiming else 0
         if claiming:
             count = len(part.ranges.rho)
-            if count >= RETESTED * tested or not claiming <= self.claimed:
+            again = count >= RETESTED * tested or not claiming <= self.claimed
+            if again:
                 tested, shifts = count, tuple(displacements(found.hypotheses[0].fit, part))
             displaced = displaced_anchor(shifts)
+            if again:
+                doubted = doubted or count if displaced is not None else 0
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
         reasons = {name: blocked(one) for name, one in judged.items()}
         return self._replace(
@@ -167,4 +180,5 @@ class Following(NamedTuple):
             reasons={name: one.reason if one is not None else "" for name, one in reasons.items()},
             displacements=shifts,
             tested=tested,
+            doubted=doubted,
         )

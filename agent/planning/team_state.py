@@ -238,7 +238,8 @@ def claimed(state: TeamState) -> TeamState:
         claim = united([one.judged[state.config.robot].localised for one in agreed], state.config.mission)
         if claim is not None:  # one of these robots is honest
             return _with_verdict(replace(state, joint=state.joint._replace(following=agreed[-1])), claim)
-    if state.tick * state.config.mission.period >= state.config.gives_up:
+    late = state.tick * state.config.mission.period >= state.config.gives_up
+    if late or state.following.displacement_confirmed:
         return _with_verdict(state, Undecided(state.joint.why_not))
     return state
 

@@ -31,11 +31,14 @@ class Displacement(NamedTuple):
     """The direction, of length 1, in which they tell least about the position."""
     open_sigma: float
     """The standard deviation (m) of the position in this direction."""
+    others: tuple[str, ...] = ()
+    """The anchors of which one may stand elsewhere instead; see AS_LIKELY."""
 
     @property
     def what(self) -> str:
         """The words for it."""
-        return f"by its ranges, {math.hypot(*self.vector):.2g} m from its position ({self.sigmas:.1f} sigmas)"
+        away = f"by its ranges, {math.hypot(*self.vector):.2g} m from its position ({self.sigmas:.1f} sigmas)"
+        return f"{away}, or {' or '.join(self.others)} does" if self.others else away
 
     def unverified(self, displaced: float) -> str:
         """Return a sentence if `displaced` m in that direction are less than DISPLACED_SIGMAS; else none."""
@@ -53,6 +56,13 @@ DISPLACED_SIGMAS = 4.0
 """The distance, in sigmas, from which on an anchor stands elsewhere than told.
 
 Honest anchors of LIAS have at most 1.1 after 40 s, and one that is 0.6 m off has 4.3 to 6.1.
+"""
+
+
+AS_LIKELY = 2.0 * math.log(100.0)
+"""The difference of squared sigmas up to which ranges do not tell which of two anchors stands elsewhere.
+
+The likelihood ratio is 100. Of two anchors alone, only their distance is known to be wrong.
 """
 
 
@@ -92,8 +102,11 @@ def _worse_at(place: Array, k: int, fit: Fit, measured: JointMeasurements) -> fl
 
 def displaced_anchor(tested: Iterable[Displacement]) -> Displacement | None:
     """Return that of the anchor which most seems to stand elsewhere; None if none does."""
-    found = max(tested, key=lambda one: one.sigmas, default=None)
-    return found if found is not None and found.sigmas > DISPLACED_SIGMAS else None
+    found = sorted(tested, key=lambda one: -one.sigmas)
+    if not found or found[0].sigmas <= DISPLACED_SIGMAS:
+        return None
+    least = found[0].sigmas ** 2 - AS_LIKELY
+    return found[0]._replace(others=tuple([one.anchor for one in found[1:] if one.sigmas**2 > least]))
 
 
 def _estimating(name: str, used: JointMeasurements) -> tuple[JointMeasurements, int, AnchorPlace]:
