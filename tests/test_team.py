@@ -239,6 +239,18 @@ def test_robots_of_a_team_keep_the_safety_distance(frame: str) -> None:
     assert summary(run, None, None)["nearest_m"] >= 0.6
 
 
+def test_robots_that_block_each_other_make_way_in_their_order() -> None:
+    """Two robots that both made way came nearer by half of what was left, again and again."""
+    mission = (
+        MISSION.replace("5.0", "2.5").replace("0.05", "0.0") + 'safety_distance = 0.6\nframe = "relative"\n'
+    )
+    run = run_mission(parse(f'name = "tight"\nseed = 1010\n{mission}[team]\nrobots = 4\nside = 4.0', "tight"))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+    assert run.end.tick < 100
+    assert summary(run, None, None)["nearest_m"] >= 0.6
+
+
 def test_robots_that_come_too_near_and_a_search_that_takes_too_long_are_violations() -> None:
     run = run_mission(SCATTERED)
     assert [one for rule in (distance, bound) for one in rule(run) if one is not None] == []
