@@ -151,6 +151,13 @@ def test_a_claim_says_across_which_line_of_anchors_no_range_tells_where_they_sta
     assert "no range tells whether A1, A2 stand elsewhere than told" in said.out
 
 
+def test_robots_survey_an_anchor_where_the_known_ones_tell_in_which_frame_it_stands() -> None:
+    """A3 and A7 are in a corner of the square from where only one of the two known anchors is in range."""
+    run = run_mission(replace(load("survey", seed=19), max_ticks=60))
+    assert run.end is not None
+    assert run.end.outcome == "localised"
+
+
 def test_a_robot_gives_up_if_twice_as_many_ranges_still_blame_one_of_two_anchors() -> None:
     """Only their distance is wrong, so both are named; more ranges would say the same for 1 009 ticks."""
     survey = file_table(load("survey"))

@@ -310,6 +310,8 @@ class AmongBeacons(NamedTuple):
     """The places (m) of the anchors and robots that it may range; (m, 2)."""
     near: Array
     """The places (m) of those of which it has to stay in range of one; (k, 2)."""
+    surveyed: bool = False
+    """True if the place of the first beacon is asked for; the covariance is that of the pose and of it."""
 
 
 def plan_among(
@@ -323,7 +325,7 @@ def plan_among(
     ways, reach = choice(mission), mission.sensing_range
     sigma = max(sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     cost, distances = np.zeros(len(ways.v)), []
-    for one, places, near in hypotheses:
+    for one, places, near, surveyed in hypotheses:
         x, y = ways.ends(one.poses)
         dx, dy = x[:, :, None] - places[:, 0], y[:, :, None] - places[:, 1]
         distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
@@ -336,9 +338,16 @@ def plan_among(
             continue
         nx, ny, weight = dx / distance, dy / distance, (distance <= reach) / sigma
         lx, ly = x[:, :, None] - one.poses[0], y[:, :, None] - one.poses[1]
-        rows = np.stack([effect * weight for effect in _effects(nx, ny, lx, ly)], -1)
-        after = _after(one.covariance, rows.reshape(len(cost), -1, 3), mission)
-        variance = _position_variance(after, 0, lx[:, -1, 0], ly[:, -1, 0])
+        effects = [effect * weight for effect in _effects(nx, ny, lx, ly)]
+        if surveyed:
+            first = np.arange(len(places)) == 0
+            effects += [-effects[0] * first, -effects[1] * first]
+        rows = np.stack(effects, -1).reshape(len(cost), -1, len(effects))
+        after = _after(one.covariance, rows, mission)
+        if surveyed:
+            variance = after[:, 3, 3] + after[:, 4, 4]
+        else:
+            variance = _position_variance(after, 0, lx[:, -1, 0], ly[:, -1, 0])
         variance += turned**2 * (x[:, -1] ** 2 + y[:, -1] ** 2)
         cost += variance / mission.accuracy**2 + after[:, 2, 2] / HEADING_ACCURACY**2
     cost += _confusion([one.planned for one in hypotheses], distances, sigma, reach)

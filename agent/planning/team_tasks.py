@@ -303,6 +303,7 @@ def _seen(state: TeamState) -> list[AmongBeacons]:
     part = state.following.part
     assert part is not None
     wanted = [part.robots.index(one) for one in state.wanted[:1] if one in part.robots]
+    surveys = bool(wanted) and state.config.robot != state.team.origin
     if state.config.robot == state.team.origin:
         wanted = [k for k in range(len(part.robots)) if k != place]
         if not wanted:
@@ -314,18 +315,25 @@ def _seen(state: TeamState) -> list[AmongBeacons]:
             PlanningHypothesis(
                 one.probability / total,
                 one.hypothesis.fit.poses[place],
-                _as_seen(one.hypothesis, place, wanted),
+                _as_seen(one.hypothesis, place, () if surveys else wanted, wanted if surveys else ()),
             ),
             *_beacons(state, one.hypothesis, wanted if state.wanted else ()),
+            surveys,
         )
         for one in chosen
     ]
 
 
-def _as_seen(hypothesis: Hypothesis, place: int, wanted: Sequence[int]) -> Array:
-    """Return the covariance of a pose, its position relative to the least accurate one that is wanted."""
+def _as_seen(
+    hypothesis: Hypothesis, place: int, wanted: Sequence[int], surveyed: Sequence[int] = ()
+) -> Array:
+    """Return the covariance of a pose and of the places of the anchors that are `surveyed`.
+
+    The position is relative to the least accurate one that is `wanted`.
+    """
     joint, own = hypothesis.fit.covariance, slice(3 * place, 3 * place + 2)
-    found = joint[3 * place : 3 * place + 3, 3 * place : 3 * place + 3].copy()
+    rows = [3 * place, 3 * place + 1, 3 * place + 2, *[3 * k + axis for k in surveyed for axis in (0, 1)]]
+    found = joint[np.ix_(rows, rows)].copy()
     places = [slice(3 * k, 3 * k + 2) for k in wanted]
     away = [joint[own, own] + joint[k, k] - joint[own, k] - joint[k, own] for k in places]
     found[:2, :2] = max(away, key=lambda one: float(np.trace(one)), default=found[:2, :2])
@@ -345,19 +353,21 @@ def _beacons(state: TeamState, hypothesis: Hypothesis, wanted: Sequence[int]) ->
     """Return the places (m) of the anchors and robots that the robot may range, and of those to stay near.
 
     Without anchors, it stays near the robot whose start is the origin. A robot that has ranged one anchor
-    only goes to another one. If an anchor is `wanted`, it counts alone.
+    only goes to another one. If an anchor is `wanted`, it is the first one, and the surveyed ones tell in
+    which frame it stands.
     """
     part = state.following.part
     assert part is not None
-    if wanted:
-        there = hypothesis.fit.poses[list(wanted), :2]
-        return there, there
     config, origin = state.config, part.origin
     known = {
         one.id: (one.position.x - origin[0], one.position.y - origin[1])
         for one in state.team.anchors
         if one.position is not None and one.id in config.ranges
     }
+    if wanted:
+        there = hypothesis.fit.poses[list(wanted), :2]
+        surveyed = [at for name, at in known.items() if name not in part.robots]
+        return np.concatenate((there, np.array(surveyed).reshape(-1, 2))), there
     found, gone, first = list(known.values()), [], None
     ranged = {state.team.anchors[one.to].id for entry in state.log.logs[state.own] for one in entry.anchors}
     if others := [place for name, place in known.items() if len(ranged) == 1 and name not in ranged]:
