@@ -485,6 +485,7 @@ def test_a_report_changes_no_entry_leaves_no_gap_and_names_no_place_beyond_the_t
 TWO = ALONE + '\n[[robot]]\nid = "b"\nstart = [2.0, 1.0, 0.0]'
 SAME = ANCHORS.replace("[3.0, 0.0]", "[0.0, 0.0]").split('[[anchor]]\nid = "A3"')[0]
 RELATIVE = MISSION.replace("accuracy", 'frame = "relative"\naccuracy')
+ATTACK = '\nattack = {kind = "shift", size = 1.0, part = "all"}'
 DRAWN = "[team]\nrobots = 2\nside = 4.0\nanchors = 3\n"
 
 
@@ -534,6 +535,19 @@ DRAWN = "[team]\nrobots = 2\nside = 4.0\nanchors = 3\n"
             {"robots": TWO, "anchors": "", "mission": RELATIVE + "tolerates = 1"},
             "mission.tolerates: with mission.frame",
         ),
+        (
+            {"robots": TWO + ATTACK, "anchors": "", "mission": RELATIVE},
+            "robot[1].attack: robots of a team believe the measurements of all others: with mission.frame,",
+        ),
+        (
+            {
+                "robots": TWO + ATTACK,
+                "anchors": ANCHORS + '[[anchor]]\nid = "A4"',
+                "mission": MISSION + "survey = 0.05",
+            },
+            "robot[1].attack: robots of a team believe the measurements of all others: with mission.survey,",
+        ),
+        ({"robots": TWO + ATTACK}, "others: set mission.tolerates = 1"),
         ({"robots": TWO + '\npeer = "a"'}, "robot[1].peer: it is not for robots that share"),
         (
             {"robots": "", "anchors": DRAWN.replace("robots = 2", "robots = 1") + "dies = 3"},
@@ -553,6 +567,20 @@ def test_a_team_that_cannot_run_is_refused_with_one_line(fields: dict[str, Any],
         team(**fields)
     assert why in str(refused.value)
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(
+    ("link", "anchors", "why"),
+    [("mutual/a", "", "the fit fails the consistency test"), ("anchor/a-A1", ANCHORS, "ranges fit no other")],
+)
+def test_a_link_of_a_team_whose_ranges_are_attacked_leads_to_no_wrong_claim(
+    link: str, anchors: str, why: str
+) -> None:
+    attacked = f'[world.range]\nmodel = "attacked"\noptions = {{link = "{link}", by = 1.0}}\n'
+    run = run_mission(replace(team(TWO, anchors + attacked, MISSION if anchors else RELATIVE), max_ticks=40))
+    assert run.end is not None
+    assert run.end.outcome == "undecided"
+    assert any(why in (one.text or "") for one in run.end.causes)
 
 
 @pytest.mark.parametrize(

@@ -125,14 +125,17 @@ def _check_attacks(file: ScenarioFile) -> None:
                 f"robot[{i}].attack: robots of a team report no start and have no phases: the kind is "
                 "scale, rotate, shift or radius, and the part 'all'"
             )
+    believing = [name for name in ("frame", "survey") if getattr(mission, name)]
     if len(attacks) > mission.tolerates:
+        remedy = f"set mission.tolerates = {len(attacks)}"
+        if believing:
+            remedy = f"with mission.{believing[0]}, none may report false data"
         raise Unworkable(
             f"robot[{attacks[mission.tolerates]}].attack: robots of a team believe the measurements of all "
-            f"others: set mission.tolerates = {len(attacks)}"
+            f"others: {remedy}"
         )
-    for name, given in (("frame", mission.frame), ("survey", mission.survey)):
-        if mission.tolerates and given:
-            raise Unworkable(f"mission.tolerates: with mission.{name}, robots have to believe others")
+    if mission.tolerates and believing:
+        raise Unworkable(f"mission.tolerates: with mission.{believing[0]}, robots have to believe others")
 
 
 def _placed_anchor(i: int, file: ScenarioFile) -> PlacedAnchor:
