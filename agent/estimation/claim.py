@@ -14,6 +14,7 @@ import numpy as np
 
 from agent.estimation.elementary import eigh
 from agent.estimation.fit import deviation
+from agent.estimation.gaussian.claim_parts import disagreement
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE, FINISHED
 from agent.estimation.gaussian.evidence import mutual_evidence
@@ -231,6 +232,13 @@ def rivals(judged: Judged) -> str:
     )
 
 
+@condition("recording", last=True)
+def parts(judged: Judged) -> str:
+    """Without each half and each third of the ranges, the pose agrees: a p-value of {CLAIM_P_VALUE:g}."""
+    found = disagreement(judged.fit, judged.robot, judged.measured)
+    return "" if found.p_value >= CLAIM_P_VALUE else f"parts of the ranges disagree: {found.what}"
+
+
 CONDITIONS = (
     hypothesis,
     anchors,
@@ -246,6 +254,7 @@ CONDITIONS = (
     evidence,
     early_consistency,
     profiles,
+    parts,
     rivals,
 )
 """All conditions for a claim, cheap ones first: which anchor is displaced has been found out before."""

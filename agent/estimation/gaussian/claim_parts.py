@@ -1,0 +1,82 @@
+"""The agreement of a claim with the poses that follow without parts of the ranges.
+
+The residuals of a fit do not show errors that it can explain by another pose: ranges of some seconds that are
+off together, or by what the place of the robot makes of them. Then parts of the ranges lead to different
+poses, by more than their covariances. Each part in turn is left out, since two fits to halves alone would
+have few ranges.
+"""
+
+from __future__ import annotations
+
+import math
+from functools import lru_cache
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.elementary import eigh, product
+from agent.estimation.fit import Fit, Start, fits
+from agent.estimation.gaussian.consistency import chi2_p_value
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from protocol.motion import wrap
+
+PARTS = {2: "half", 3: "third"}
+"""The numbers of parts, each with as many ranges, in the order of time, and their names.
+
+Halves alone overlook errors that reach from one into the other; parts smaller than thirds are as long as an
+error lasts, and what is left has it as well.
+"""
+
+
+class Disagreement(NamedTuple):
+    """The pose without a part of the ranges that differs most from a claim."""
+
+    what: str
+    """The words for the part, and for the difference."""
+    p_value: float
+    """The probability of such a difference, if the covariance is right."""
+
+
+MOST_KNOWN = 0.5
+"""The largest fraction of a variance without a part that counts as known with it, too.
+
+The poses with and without a part differ by the difference of their covariances, which is all rounding and
+noise level where a part tells nothing. Where it tells as much as the others, half is left.
+"""
+
+
+@lru_cache(maxsize=2)
+def fits_without_parts(fit: Fit, measured: JointMeasurements) -> tuple[tuple[str, Fit], ...]:
+    """Return the fits to what was `measured` without each part of the ranges, from `fit` on, by its name."""
+    ranges, found = measured.ranges, []
+    count, order = len(ranges.rho), ranges.tick.argsort(kind="stable")
+    for parts, name in PARTS.items():
+        for part in range(parts):
+            left = np.ones(count, bool)
+            left[order[part * count // parts : (part + 1) * count // parts]] = False
+            start = Start(fit.start.poses, fit.start.errors, fit.weights[left])
+            rest = replace(measured, ranges=ranges.rows(left), solver=None)
+            found += [(f"{ORDINALS[part]} {name}", one) for one in fits(rest, [start])]
+    return tuple(found)
+
+
+ORDINALS = ("first", "second", "third")
+
+
+def disagreement(fit: Fit, robot: int, measured: JointMeasurements) -> Disagreement:
+    """Return by how much the pose of a robot differs without one of the parts of the ranges, the worst."""
+    own, worst, what = slice(3 * robot, 3 * robot + 3), 0.0, "without a part"
+    for part, without in fits_without_parts(fit, measured):
+        away = without.poses[robot] - fit.poses[robot]
+        away[2] = wrap(float(away[2]))
+        variances, axes = eigh(without.covariance[own, own])
+        if not variances[0] > 0.0:
+            continue
+        white = axes / np.sqrt(variances)
+        shares, turned = eigh(product(product(white.T, fit.covariance[own, own]), white))
+        off = np.square(product(product(away[None], white), turned)[0])
+        chi2 = float(np.sum(off / (1.0 - np.clip(shares, 0.0, MOST_KNOWN))))
+        if chi2 > worst:
+            worst, what = chi2, f"without the {part} of the ranges"
+    return Disagreement(f"{what}, it is {math.sqrt(worst):.2g} sigmas off", chi2_p_value(worst, 3))
