@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
-from agent.estimation.fit import Fit
+from agent.estimation.fit import Fit, with_told_priors
 from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
 from agent.estimation.gaussian.consistency import HIGHEST_LEVEL, chi2_p_value, consistency_test
 from agent.estimation.gaussian.inference import (
@@ -173,6 +173,8 @@ def of_joint(
     `certainty` is that of its pose; `measured` are the measurements of all these robots.
     """
     fit = found.hypotheses[0].fit
+    if user == "recording":
+        fit = with_told_priors(fit)
     return Judged(
         user=user,
         robot=robot,

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.elementary import eigh, product
-from agent.estimation.fit import Fit, Start, fits
+from agent.estimation.fit import Fit, Start, fits, with_told_priors
 from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from protocol.motion import wrap
@@ -57,7 +57,7 @@ def fits_without_parts(fit: Fit, measured: JointMeasurements) -> tuple[tuple[str
             left[order[part * count // parts : (part + 1) * count // parts]] = False
             start = Start(fit.start.poses, fit.start.errors, fit.weights[left])
             rest = replace(measured, ranges=ranges.rows(left), solver=None)
-            found += [(f"{ORDINALS[part]} {name}", one) for one in fits(rest, [start])]
+            found += [(f"{ORDINALS[part]} {name}", one) for one in map(with_told_priors, fits(rest, [start]))]
     return tuple(found)
 
 

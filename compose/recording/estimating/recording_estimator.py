@@ -9,7 +9,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.estimation.fit import Fit
+from agent.estimation.fit import Fit, with_told_priors
 from agent.estimation.following import ClaimRule, Following
 from agent.estimation.gaussian.joint_claims import open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -119,7 +119,10 @@ def _result(
     more = f"; and {len(reason) - 1} more" if len(reason) > 1 else ""
     claims = {one.id: reasons.get(one.id) == "" for one in measured.robots}
     centres = [
-        {one.id: _centre(one.recorded, place[one.id], each.fit, used.origin) for one in posed}
+        {
+            one.id: _centre(one.recorded, place[one.id], with_told_priors(each.fit), used.origin)
+            for one in posed
+        }
         for each in found.hypotheses
     ]
     rows = [
