@@ -280,26 +280,27 @@ AS_IT_IS = Convergence(0)
 """The convergence of a fit that stays where it begins."""
 
 
-FINER = 1e-3
-"""The fraction by which variances of ranges are increased to find their part of a covariance."""
+LARGER = 1e-3
+"""The fraction by which white variances are increased to find their part of a covariance."""
 
 
 @lru_cache(maxsize=8)
 def with_told_priors(fit: Fit) -> Fit:
-    """Return `fit` with the covariance that it has if a noise level below 1 is one of the ranges only.
+    """Return `fit` with the covariance that it has if a noise level below 1 is one of white errors only.
 
-    Small residuals tell that ranges are repeated accurately. They do not tell that the biases of radios, or
-    the errors of the odometry, are smaller than their priors. The part of the ranges is, with a gain K and
-    their variances R, K R K', the derivative of the covariance by the logarithm of R.
+    Small residuals tell that ranges and odometry are repeated accurately. They do not tell that biases and
+    slow errors are smaller than their priors. With a gain K and white variances R, the part of these is
+    K R K', which is the derivative of the covariance by the logarithm of R.
     """
     if not fit.level < 1.0:
         return fit
-    linear, ends = fit.linear, fit.linear.step.ends
+    (kernel, walk, poses, variance, step), of = fit.linear, fit.linear.kernel.of
+    larger = Kernel(of._replace(white=(1.0 + LARGER) * of.white), kernel.by)
     try:
-        more = linear.kernel.step(linear.walk, linear.poses, (1.0 + FINER) * linear.variance, RIDGE, math.inf)
+        ends = larger.step(walk, poses, (1.0 + LARGER) * variance, RIDGE, math.inf).ends
     except Singular:
         return fit
-    return fit._replace(covariance=ends - (1.0 - fit.level) / FINER * (more.ends - ends))
+    return fit._replace(covariance=step.ends - (1.0 - fit.level) / LARGER * (ends - step.ends))
 
 
 class HeldFit(NamedTuple):
