@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Container, Mapping
 from typing import NamedTuple
 
-from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, strays
+from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, parts, strays
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, displacements
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -91,6 +91,8 @@ class Following(NamedTuple):
     """The number of ranges at that test."""
     doubted: int = 0
     """The number of ranges since which all tests have found such an anchor; 0 if the latest has not."""
+    disagreed: Mapping[str, int] = {}
+    """The number of ticks after which parts of the ranges have disagreed last, of each robot."""
     begun_again: int = 0
     """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
 
@@ -157,7 +159,9 @@ class Following(NamedTuple):
         found = self.known
         part = used.some(found.located)
         judged = {
-            part.robots[i]: of_joint(user, i, found, certainty, part, *rule)
+            part.robots[i]: of_joint(
+                user, i, found, certainty, part, *rule, self.disagreed.get(part.robots[i], 0)
+            )
             for i, certainty in enumerate(certainties(found))
             if part.robots[i] in asked and not part.is_anchor(i)
         }
@@ -174,6 +178,9 @@ class Following(NamedTuple):
                 doubted = doubted or count if displaced is not None else 0
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
         reasons = {name: blocked(one) for name, one in judged.items()}
+        disagreed = {
+            name: judged[name].passed for name, one in reasons.items() if one and one.condition is parts
+        }
         return self._replace(
             part=part,
             judged=judged,
@@ -181,4 +188,5 @@ class Following(NamedTuple):
             displacements=shifts,
             tested=tested,
             doubted=doubted,
+            disagreed={**self.disagreed, **disagreed},
         )

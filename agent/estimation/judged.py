@@ -103,6 +103,13 @@ class Judged(NamedTuple):
     """The robots of which rivals are looked for."""
     displaced: Displacement | None = None
     """The anchor that seems to stand elsewhere than it was surveyed, if one does."""
+    disagreed: int = 0
+    """The number of ticks after which parts of the ranges have disagreed last."""
+
+    @property
+    def passed(self) -> int:
+        """The number of ticks so far."""
+        return max([len(path.v) for path in self.measured.paths])
 
     @property
     def rival(self) -> Rival:
@@ -167,6 +174,7 @@ def of_joint(
     measured: JointMeasurements,
     accuracy: float,
     confidence: float,
+    disagreed: int = 0,
 ) -> Judged:
     """Return the estimate of the robot with the index `robot` among those that the fits `found` have.
 
@@ -190,4 +198,5 @@ def of_joint(
         headings=((robot, "the", HEADING_ACCURACY),),
         confidence=confidence,
         rivals_of=(robot,),
+        disagreed=disagreed,
     )
