@@ -241,7 +241,10 @@ def rivals(judged: Judged) -> str:
 
 @condition("recording", last=True)
 def parts(judged: Judged) -> str:
-    """The pose agrees with those without each half and third of the ranges: a p-value of {CLAIM_P_VALUE:g}."""
+    """The pose agrees with those without each half and each third of the ranges, in the order of time.
+
+    Each difference has a p-value of at least {CLAIM_P_VALUE:g}.
+    """
     found = disagreement(judged.fit, judged.robot, judged.measured)
     return "" if found.p_value >= CLAIM_P_VALUE else f"parts of the ranges disagree: {found.what}"
 

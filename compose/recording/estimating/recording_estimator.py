@@ -118,12 +118,9 @@ def _result(
     reason += [f"{name} is undetermined: {why}" for name, why in without.items()]
     more = f"; and {len(reason) - 1} more" if len(reason) > 1 else ""
     claims = {one.id: reasons.get(one.id) == "" for one in measured.robots}
+    fits = [with_told_priors(each.fit) for each in found.hypotheses]
     centres = [
-        {
-            one.id: _centre(one.recorded, place[one.id], with_told_priors(each.fit), used.origin)
-            for one in posed
-        }
-        for each in found.hypotheses
+        {one.id: _centre(one.recorded, place[one.id], fit, used.origin) for one in posed} for fit in fits
     ]
     rows = [
         pose_row(one.recorded, t, sure[place[one.id]], *centres[0][one.id], claim=claims[one.id])
@@ -139,7 +136,7 @@ def _result(
         tuple(np.bincount(part.ranges.radio, minlength=len(measured.joint.radios)).tolist()),
         tuple(claims.values()),
         reason[0] + more if reason else "",
-        EpochFit(found.hypotheses[0].fit, part) if found.hypotheses else None,
+        EpochFit(fits[0], part) if fits else None,
         without,
     )
 
