@@ -41,8 +41,8 @@ NORMAL_RATIO = -0.5 * WRONG_SIGMAS**2
 MORE_TIME = 1.5
 """The factor by which the time must have grown since parts of the ranges disagreed.
 
-The ranges that follow at once repeat the errors of the last ones. Without it, 10 more claims of MRCLAM 6 are
-wrong; with more, a claim takes longer after a disagreement by chance.
+The ranges that follow at once repeat the errors of the last ones. Without it, 10 more claims of single robots
+of MRCLAM 6 are wrong; with more, a claim takes longer after a disagreement by chance.
 """
 
 MOST_WIDENED = 2.5
@@ -241,7 +241,7 @@ def rivals(judged: Judged) -> str:
 
 @condition("recording", last=True)
 def parts(judged: Judged) -> str:
-    """The pose agrees with those without each half and each third of the ranges, in the order of time.
+    """The pose agrees with those without each half and each third of the robot's ranges, in their order.
 
     Each difference has a p-value of at least {CLAIM_P_VALUE:g}.
     """

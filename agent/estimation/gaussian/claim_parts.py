@@ -1,9 +1,8 @@
-"""The agreement of a claim with the poses that follow without parts of the ranges.
+"""The agreement of a claim with the poses that follow without parts of the robot's ranges.
 
-The residuals of a fit do not show errors that it can explain by another pose: ranges of some seconds that are
-off together, or by what the place of the robot makes of them. Then parts of the ranges lead to different
-poses, by more than their covariances. Each part in turn is left out, since two fits to halves alone would
-have few ranges.
+The residuals of a fit do not show errors that another pose explains, such as those of ranges that are off
+together for some seconds. Parts of the ranges then lead to poses that differ by more than their covariances.
+Each part is left out in turn: a fit to one part alone would have few ranges.
 """
 
 from __future__ import annotations
@@ -24,8 +23,8 @@ from protocol.motion import wrap
 PARTS = {2: "half", 3: "third"}
 """The numbers of parts, each with as many ranges, in the order of time, and their names.
 
-Halves alone overlook errors that reach from one into the other; parts smaller than thirds are as long as an
-error lasts, and what is left has it as well.
+Halves alone overlook errors that reach from one into the other. Quarters and fifths found no more wrong
+claims of MRCLAM 6, but a right one.
 """
 
 
@@ -41,19 +40,23 @@ class Disagreement(NamedTuple):
 MOST_KNOWN = 0.5
 """The largest fraction of a variance without a part that counts as known with it, too.
 
-The poses with and without a part differ by the difference of their covariances, which is all rounding and
-noise level where a part tells nothing. Where it tells as much as the others, half is left.
+The covariance of the difference of two poses, with and without a part, is the difference of theirs. It is
+hardly known where the part tells little; where it tells as much as all others, this is exact.
 """
 
 
 @lru_cache(maxsize=2)
-def fits_without_parts(fit: Fit, measured: JointMeasurements) -> tuple[tuple[str, Fit], ...]:
-    """Return the fits to what was `measured` without each part of the ranges, from `fit` on, by its name."""
+def fits_without_parts(fit: Fit, robot: int, measured: JointMeasurements) -> tuple[tuple[str, Fit], ...]:
+    """Return the fits to what was `measured` without each part of a robot's ranges, by the name of the part.
+
+    They begin at `fit`.
+    """
     ranges, found = measured.ranges, []
-    count, order = len(ranges.rho), ranges.tick.argsort(kind="stable")
+    own = np.flatnonzero(ranges.of(robot))
+    order, count = own[ranges.tick[own].argsort(kind="stable")], len(own)
     for parts, name in PARTS.items():
         for part in range(parts):
-            left = np.ones(count, bool)
+            left = np.ones(len(ranges.rho), bool)
             left[order[part * count // parts : (part + 1) * count // parts]] = False
             start = Start(fit.start.poses, fit.start.errors, fit.weights[left])
             rest = replace(measured, ranges=ranges.rows(left), solver=None)
@@ -67,7 +70,7 @@ ORDINALS = ("first", "second", "third")
 def disagreement(fit: Fit, robot: int, measured: JointMeasurements) -> Disagreement:
     """Return by how much the pose of a robot differs without one of the parts of the ranges, the worst."""
     own, worst, what = slice(3 * robot, 3 * robot + 3), 0.0, "without a part"
-    for part, without in fits_without_parts(fit, measured):
+    for part, without in fits_without_parts(fit, robot, measured):
         away = without.poses[robot] - fit.poses[robot]
         away[2] = wrap(float(away[2]))
         variances, axes = eigh(without.covariance[own, own])
