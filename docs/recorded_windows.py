@@ -92,12 +92,12 @@ def recording_of(source: Path) -> RangeRecording:
 
 
 def windows_of(series: Series, source: Path) -> Iterator[Window]:
-    """Yield all windows of a series that the recording is long enough for, at least one."""
+    """Yield all windows of a series for which the recording is long enough, but for 1 s; at least one."""
     recording = recording_of(source)
     first, last = recording.span
     names = [one.id for one in recording.robots]
     for robots in itertools.combinations(names, series.robots or len(names)):
-        begins = np.arange(0.0, max(last - first - 0.5 * series.seconds, 1.0), series.step_s)
+        begins = np.arange(0.0, max(last - first - series.seconds, 0.0) + 1.0, series.step_s)
         for begin_s in begins.tolist():
             yield Window(series, source, robots, begin_s)
 
