@@ -19,7 +19,7 @@ from protocol.orbits import RENDEZVOUS, Orbit
 from protocol.sweep_strips import SweptArea
 from protocol.units import RobotId, Tick
 from world.faults import Fault
-from world.scenario import Scenario
+from world.scenario import RobotSpec, Scenario
 
 
 class RobotSetup(msgspec.Struct, frozen=True):
@@ -221,26 +221,11 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
 
     `mode` and `tick_s` are not part of the scenario; see the fields of RunSetup.
     """
-    team = scenario.team
+    team, planned = scenario.team, scenario.planned_sweep
+    own_planner = scenario.planner_name not in RENDEZVOUS and not scenario.meetings
     return RunSetup(
         name=scenario.name,
-        robots=tuple(
-            [
-                RobotSetup(robot.id)
-                if robot.encounter is None
-                else RobotSetup(
-                    robot.id,
-                    robot.peer,
-                    robot.role,
-                    robot.given_anchor,
-                    robot.rendezvous.of(robot.role),
-                    robot.attack,
-                    frame(robot.anchor, robot.start) if robot.given_anchor is not None else None,
-                    scenario.planner_name not in RENDEZVOUS and not scenario.meetings,
-                )
-                for robot in scenario.robots
-            ]
-        ),
+        robots=tuple([_robot(one.id, one, one.start, own_planner=own_planner) for one in scenario.robots]),
         mission=scenario.mission,
         planner_name=scenario.planner_name,
         t_max_s=_bound(scenario),
@@ -250,7 +235,7 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
         tick_s=tick_s,
         faults=scenario.faults,
         visits=tuple([Visit(one.visitor, one.visited, one.ends) for one in scenario.meetings]),
-        sweep=scenario.planned_sweep.sweep if scenario.planned_sweep is not None else None,
+        sweep=planned.sweep if planned is not None else None,
         team=team is not None,
         anchors=tuple([_anchor(one.told, one.place) for one in team.anchors]) if team is not None else (),
         origin=team.origin if team is not None else None,
@@ -278,45 +263,35 @@ def of_configs(name: str, configs_by_robot: Mapping[str, RobotConfig]) -> RunSet
     `configs_by_robot` maps robot ids to configurations and must not be empty.
     """
     configs = list(configs_by_robot.values())
-    if (team := configs[0].team) is not None:
-        return RunSetup(
-            name=name,
-            robots=tuple([RobotSetup(one.robot) for one in configs]),
-            mission=configs[0].mission,
-            planner_name=configs[0].planner_name,
-            t_max_s=team.bound,
-            tick_s=configs[0].tick_s,
-            team=True,
-            anchors=tuple(map(_anchor, team.anchors)),
-            origin=team.origin,
-        )
-    visits = _visits(configs)
-    unanchored = [one for one in configs if one.given_anchor is None]
+    first, team = configs[0], configs[0].team
+    visits = _visits(configs) if team is None else []
+    waiting = [one for one in configs if one.given_anchor is None and team is None]
+    bounds = [one.ends_s for one in visits] or [one.rendezvous.bound for one in configs if team is None]
+    if waiting:
+        bounds = [one.rendezvous.bound for one in waiting]
+    own_planner = first.planner_name not in RENDEZVOUS and not visits
     return RunSetup(
         name=name,
-        robots=tuple(
-            [
-                RobotSetup(
-                    one.robot,
-                    one.peer,
-                    one.role,
-                    one.given_anchor,
-                    one.rendezvous.of(one.role),
-                    one.attack,
-                    own_planner=one.planner_name not in RENDEZVOUS and not visits,
-                )
-                for one in configs
-            ]
-        ),
-        mission=configs[0].mission,
-        planner_name=configs[0].planner_name,
-        t_max_s=max([one.rendezvous.bound for one in unanchored])
-        if unanchored
-        else max([one.ends_s for one in visits] or [one.rendezvous.bound for one in configs]),
-        tick_s=configs[0].tick_s,
+        robots=tuple([_robot(one.robot, one, None, own_planner=own_planner) for one in configs]),
+        mission=first.mission,
+        planner_name=first.planner_name,
+        t_max_s=team.bound if team is not None else max(bounds),
+        tick_s=first.tick_s,
         visits=tuple(visits),
-        sweep=unanchored[0].sweep if unanchored else None,
+        sweep=waiting[0].sweep if waiting else None,
+        team=team is not None,
+        anchors=tuple(map(_anchor, team.anchors)) if team is not None else (),
+        origin=team.origin if team is not None else None,
     )
+
+
+def _robot(name: str, one: RobotSpec | RobotConfig, start: Pose | None, *, own_planner: bool) -> RobotSetup:
+    """Return a robot; the frame of its anchor follows from its `start`, if that is known."""
+    if (meeting := one.encounter) is None:
+        return RobotSetup(name)
+    at, orbit = one.given_anchor, meeting.rendezvous.of(meeting.role)
+    own_frame = frame(at, start) if at is not None and start is not None else None
+    return RobotSetup(name, meeting.peer, meeting.role, at, orbit, one.attack, own_frame, own_planner)
 
 
 def _visits(configs: Sequence[RobotConfig]) -> list[Visit]:
