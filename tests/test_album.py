@@ -364,7 +364,13 @@ def test_each_kind_of_figure_is_drawn_or_the_reason_is_printed(
 ) -> None:
     told = pair(recorded(name, recordings))
     kinds = [kind for kind in PICTURES if kind != "robot"]
-    out = [path for kind in kinds for path in draw(told, kind, ["svg"], tmp_path, torn=False, medium=SCREEN)]
+    out = [
+        path
+        for kind in kinds
+        for path in draw(
+            partial(catalogue.pictures, told, kind), ["svg"], tmp_path, torn=False, medium=SCREEN
+        )
+    ]
     err = capsys.readouterr().err
     made = {path.stem for path in tmp_path.iterdir()}
     missing = ABSENT.get(name, set())

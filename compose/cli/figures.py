@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
@@ -25,6 +25,7 @@ if TYPE_CHECKING:
     from compose.figures.catalogue import Picture
     from compose.figures.pair import PairRecord
     from compose.figures.style import Medium
+    from compose.recording.group_localisation import PastMeeting
 
 
 def main(options: argparse.Namespace) -> int:
@@ -33,12 +34,13 @@ def main(options: argparse.Namespace) -> int:
     Return FAILED if the journal of a robot is missing or cannot be replayed to its end.
     """
     need("matplotlib")
-    from compose.figures.pair import encounters, pair_of  # noqa: PLC0415
+    from compose.figures import catalogue, style, team_figures  # noqa: PLC0415
+    from compose.figures.pair import encounters  # noqa: PLC0415
 
     with user_errors(options.recording):
         run = read_noted(options.recording, "figures")
     folder, status = options.out or options.recording / "figures", ENDED
-    medium = _medium(options)
+    medium = (style.PAPER if options.paper else style.SCREEN)._replace(keyed=not options.no_legend)
     kinds = [kind for kind in PICTURES if kind in (options.only or PICTURES)]
     formats = [one for one in FIGURE_FORMATS if one in (options.format or FIGURE_FORMATS)]
     pairs = encounters(run)
@@ -59,55 +61,28 @@ def main(options: argparse.Namespace) -> int:
                 status = FAILED
             done()
         if team:
-            drawn += _draw_team(run, kinds, formats, folder, medium=medium)
+            if others := [kind for kind in kinds if kind not in team_figures.DRAWN]:
+                _say(
+                    f"no {', '.join(others)}: the robots of a team share all measurements, and form no pairs"
+                )
+            torn = run.world is None or run.world.end is None
+            for kind in kinds:
+                drawn += draw(
+                    partial(catalogue.of_team, run, kind), formats, folder, torn=torn, medium=medium
+                )
         for meeting in pairs:
-            robots = dict.fromkeys((meeting.a, meeting.b))
-            histories = {robot: replays[robot].history for robot in robots if robot in replays}
-            torn = [robot for robot, one in histories.items() if one is not None and one.end is None]
-            torn += ["the world"] if run.world is not None and run.world.end is None else []
-            if torn:
-                _say(f"the recording of {' and '.join(torn)} ends before the mission does")
-            pair = pair_of(run, meeting, replays)
+            pair, early = _pair(run, meeting, replays)
             if pair is None:
-                _say(f"no figure of {' and '.join(robots)}: the recording has no data")
                 status = FAILED
                 continue
-            with writing(folder):
-                for kind in kinds:
-                    drawn += draw(pair, kind, formats, folder, torn=bool(torn), medium=medium)
-                    done()
+            for kind in kinds:
+                pictures = partial(catalogue.pictures, pair, kind)
+                drawn += draw(pictures, formats, folder, torn=early, medium=medium)
+                done()
     return status
 
 
 def draw(
-    pair: PairRecord, kind: str, formats: Sequence[str], folder: Path, *, torn: bool, medium: Medium
-) -> list[Path]:
-    """Draw the figures of `kind`, print why one does not apply, and return the paths of the files.
-
-    `torn` states that the recording is incomplete, so that an event that it lacks may have happened.
-    Raises OSError.
-    """
-    from compose.figures import catalogue  # noqa: PLC0415
-
-    return _save(partial(catalogue.pictures, pair, kind), formats, folder, torn=torn, medium=medium)
-
-
-def _draw_team(
-    run: Run, kinds: Sequence[str], formats: Sequence[str], folder: Path, *, medium: Medium
-) -> list[Path]:
-    """Draw the figures of a team, print which are not of teams, and return the paths. Raises UserError."""
-    from compose.figures import catalogue, team_figures  # noqa: PLC0415
-
-    if others := [kind for kind in kinds if kind not in team_figures.DRAWN]:
-        _say(f"no {', '.join(others)}: the robots of a team share all measurements, and form no pairs")
-    torn, paths = run.world is None or run.world.end is None, list[Path]()
-    with writing(folder):
-        for kind in kinds:
-            paths += _save(partial(catalogue.of_team, run, kind), formats, folder, torn=torn, medium=medium)
-    return paths
-
-
-def _save(
     pictures: Callable[[Medium], Iterable[Picture]],
     formats: Sequence[str],
     folder: Path,
@@ -115,13 +90,17 @@ def _save(
     torn: bool,
     medium: Medium,
 ) -> list[Path]:
-    """Save `pictures`, as `draw` does."""
+    """Save the figures of one kind, print why one does not apply, and return the paths of the files.
+
+    `torn` states that the recording is incomplete, so that an event that it lacks may have happened.
+    Raises UserError if they cannot be written.
+    """
     from compose.figures import style  # noqa: PLC0415
     from compose.figures.sheet import Absent  # noqa: PLC0415
 
-    folder.mkdir(parents=True, exist_ok=True)
     paths: list[Path] = []
-    with style.look(medium):
+    with writing(folder), style.look(medium):
+        folder.mkdir(parents=True, exist_ok=True)
         for name, figure in pictures(medium):
             if isinstance(figure, Absent):
                 _say(f"no {name}: {figure.why}{' (in the incomplete recording)' if torn else ''}")
@@ -133,12 +112,21 @@ def _save(
     return paths
 
 
-def _medium(options: argparse.Namespace) -> Medium:
-    """Return the medium for which the flags ask."""
-    from compose.figures import style  # noqa: PLC0415
+def _pair(
+    run: Run, meeting: PastMeeting, replays: Mapping[str, AgentReplay]
+) -> tuple[PairRecord | None, bool]:
+    """Return the data of a meeting, and whether its recording is incomplete; print what is missing."""
+    from compose.figures.pair import pair_of  # noqa: PLC0415
 
-    medium = style.PAPER if options.paper else style.SCREEN
-    return medium._replace(keyed=not options.no_legend)
+    robots = dict.fromkeys((meeting.a, meeting.b))
+    histories = {robot: replays[robot].history for robot in robots if robot in replays}
+    torn = [robot for robot, one in histories.items() if one is not None and one.end is None]
+    torn += ["the world"] if run.world is not None and run.world.end is None else []
+    if torn:
+        _say(f"the recording of {' and '.join(torn)} ends before the mission does")
+    if (pair := pair_of(run, meeting, replays)) is None:
+        _say(f"no figure of {' and '.join(robots)}: the recording has no data")
+    return pair, bool(torn)
 
 
 def _replay(run: Run, robot: str) -> AgentReplay | None:
