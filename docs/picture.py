@@ -134,7 +134,7 @@ def decisions(run: Run) -> dict[str, Any]:
 def page(folder: Path, wanted: Mapping[str, str]) -> None:
     """Draw the guided play of paper-1, and one picture of it."""
     ran("paper-1", folder)
-    html = standalone_page(folder).html
+    html = standalone_page(folder)[0]
     if "page.gif" in wanted:
         (folder / "page.gif").write_bytes(film.gif(html))
     if "page.png" in wanted:

@@ -464,7 +464,9 @@ TABLES: dict[str, Callable[[], str]] = {
     "range-models": partial(models, RANGE_MODELS),
     "radio-models": partial(models, RADIO_MODELS),
     "packages": packages,
-    "removed": lambda: _table(["removed", "instead"], [[f"`{one.name}`", one.instead] for one in REMOVED]),
+    "removed": lambda: _table(
+        ["removed", "instead"], [[f"`{one}`", instead] for one, instead in REMOVED.items()]
+    ),
     **{f"results-{name}": partial(results_of, name) for name in spec.shipped()},
 }
 """the tables by the names that pages use"""

@@ -458,9 +458,9 @@ def test_a_port_in_use_is_one_line(tmp_path: Path) -> None:
 
 
 def test_what_was_removed_is_one_line_that_names_what_replaces_it() -> None:
-    for removed in REMOVED:
-        with pytest.raises(UserError, match=re.escape(f"`{removed.name}` was removed in version 0.3: ")):
-            main.parse(removed.name.split())
+    for name in REMOVED:
+        with pytest.raises(UserError, match=re.escape(f"`{name}` was removed in version 0.3: ")):
+            main.parse(name.split())
     for seeds in ("--seed=1..3", "--seed 1..3"):
         with pytest.raises(UserError, match=re.escape("`run --seed N..N` was removed")):
             main.parse(["run", "paper-1", *seeds.split()])
@@ -468,7 +468,7 @@ def test_what_was_removed_is_one_line_that_names_what_replaces_it() -> None:
 
 
 def test_no_flag_begins_with_the_abbreviation_of_one_that_was_removed() -> None:
-    for command, _, flag in (removed.name.partition(" ") for removed in REMOVED):
+    for command, _, flag in (name.partition(" ") for name in REMOVED):
         if re.fullmatch("--[a-z0-9-]+", flag):
             entry = next(one for one in commands.COMMANDS if one.name == command)
             assert not re.findall(rf"{flag[:4]}[\w-]*", main.command_parser(entry).format_help())

@@ -49,7 +49,7 @@ def test_virtual_processes_that_are_killed_write_the_recording_of_one_process(
     mission = load("paper-1")
     kills = [kill(f"{who}@{tick}:{point}") for who in ("a", "b", "world") for tick in (0, 42, 47)]
     ended = virtual_processes.run_mission(mission, tmp_path, kills)
-    assert (ended.failures, ended.kills) == ((), 9 if point != "report" else 5)  # no Report without contact
+    assert (ended.failures, ended.taken) == ([], 9 if point != "report" else 5)  # no Report without contact
     journals = {name: MemoryJournal() for name in in_process.journals(mission)}
     in_process.played(mission, journals)
     assert {name: packed(one.frames) for name, one in journals.items()} == {
@@ -59,7 +59,7 @@ def test_virtual_processes_that_are_killed_write_the_recording_of_one_process(
 
 def test_a_virtual_process_that_is_not_started_again_is_missed(tmp_path: Path) -> None:
     ended = virtual_processes.run_mission(load("paper-1"), tmp_path, [kill("b@5+never")])
-    assert (ended.kills, ended.failures) == (1, ("a process that was killed is missing",))
+    assert (ended.taken, ended.failures) == (1, ["a process that was killed is missing"])
 
 
 # --- the search ---------------------------------------------------------------------------------------

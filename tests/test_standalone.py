@@ -70,8 +70,8 @@ def test_it_shows_what_the_page_of_the_server_shows(
 
 def test_it_is_small_and_the_same_each_time(tmp_path: Path) -> None:
     run = in_process.run_mission(load("noisy", seed=3), tmp_path)
-    page = standalone_page(tmp_path).html
-    assert page == standalone_page(tmp_path).html
+    page = standalone_page(tmp_path)[0]
+    assert page == standalone_page(tmp_path)[0]
     assert len(page.encode()) < MOST_BYTES * max(1.0, run.length / 100)
 
 
@@ -93,7 +93,7 @@ COSTS = [
 @pytest.mark.parametrize(("scenario", "cost"), COSTS)
 def test_the_last_caption_says_what_faults_cost(scenario: Scenario, cost: str | None, tmp_path: Path) -> None:
     in_process.run_mission(scenario, tmp_path)
-    page = standalone_page(tmp_path).html
+    page = standalone_page(tmp_path)[0]
     assert ('"kind":"cost"' in page) == (cost is not None)
     assert cost is None or f'"truth":"{cost}"' in page
 
@@ -103,13 +103,13 @@ def test_a_cost_that_takes_too_long_to_compute_is_left_out(
 ) -> None:
     monkeypatch.setattr(costs, "MOST_WALL_S", 0.0)
     in_process.run_mission(COSTS[0][0], tmp_path)
-    assert '"kind":"cost"' not in standalone_page(tmp_path).html
+    assert '"kind":"cost"' not in standalone_page(tmp_path)[0]
 
 
 def test_no_text_of_a_run_ends_its_script(tmp_path: Path) -> None:
     """A verdict is written by a robot, which may be anybody's."""
     in_process.run_mission(load("paper-1"), tmp_path)
-    page = standalone_page(tmp_path).html
+    page = standalone_page(tmp_path)[0]
     inside = re.search(r'<script type="application/json" id="recording">(.*?)</script>', page, re.DOTALL)
     assert inside is not None
     assert "<" not in inside[1]

@@ -40,18 +40,18 @@ def _pyfg(recording: Path, out: Path) -> None:
     from compose.recording.ranging.run_ranges import ranges_of_run  # noqa: PLC0415
 
     with recording_files.user_errors(recording):
-        graph = written_pyfg(ranges_of_run(read_noted(recording, "export")))
-    _write(out, "run.pyfg", graph.text)
-    tell(", ".join([f"{name} is {letter}" for name, letter in graph.names.items()]))
+        text, names = written_pyfg(ranges_of_run(read_noted(recording, "export")))
+    _write(out, "run.pyfg", text)
+    tell(", ".join([f"{name} is {letter}" for name, letter in names.items()]))
 
 
 def _html(recording: Path, out: Path) -> None:
     """Write run.html to `out`, and print its path and what the recording lacks."""
     from compose.view.web.standalone import standalone_page  # noqa: PLC0415  # it imports Zenoh
 
-    page = standalone_page(recording)
-    _write(out, "run.html", page.html)
-    note("export", page.notes)
+    page, notes = standalone_page(recording)
+    _write(out, "run.html", page)
+    note("export", notes)
 
 
 def _rerun(recording: Path, out: Path) -> None:

@@ -4,37 +4,27 @@ from __future__ import annotations
 
 import re
 from collections.abc import Sequence
-from typing import NamedTuple, NoReturn
+from typing import NoReturn
 
 from compose.errors import UserError
 
-
-class Removed(NamedTuple):
-    """A removed command, or a removed flag of a command."""
-
-    name: str
-    """The command, or the command and its flag, separated by one blank."""
-    instead: str
-    """The replacement, as the end of a sentence."""
-
-
 _FOXGLOVE = "use `--watch`, or open run.mcap of `tandem export` in Foxglove"
-REMOVED = (
-    Removed("run --foxglove", _FOXGLOVE),
-    Removed("run --foxglove-origin", _FOXGLOVE),
-    Removed("export --gif", "use `--html`, whose page plays the mission"),
-    Removed("export --mp4", "use `--html`, whose page plays the mission"),
-    Removed("bench", "`uv run python -m tests.benchmark` in a clone measures the same"),
-    Removed("estimate --all-anchors", "all anchors are used without it"),
-    Removed("run SCENARIO SCENARIO", "a loop of the shell runs several files"),
-    Removed("run --seed N..N", "`tandem sweep` runs many seeds, with one table"),
-)
+REMOVED = {
+    "run --foxglove": _FOXGLOVE,
+    "run --foxglove-origin": _FOXGLOVE,
+    "export --gif": "use `--html`, whose page plays the mission",
+    "export --mp4": "use `--html`, whose page plays the mission",
+    "bench": "`uv run python -m tests.benchmark` in a clone measures the same",
+    "estimate --all-anchors": "all anchors are used without it",
+    "run SCENARIO SCENARIO": "a loop of the shell runs several files",
+    "run --seed N..N": "`tandem sweep` runs many seeds, with one table",
+}
+"""The replacement, as the end of a sentence, of a command, or of a command and its flag."""
 
 
 def removed(name: str) -> UserError:
     """Return the error for the row `name` of REMOVED."""
-    instead = next(one.instead for one in REMOVED if one.name == name)
-    return UserError(f"`{name}` was removed in version 0.3: {instead}")
+    return UserError(f"`{name}` was removed in version 0.3: {REMOVED[name]}")
 
 
 def another_scenario(_: str) -> NoReturn:
@@ -47,7 +37,7 @@ def refuse_removed(words: Sequence[str]) -> None:
     if words[:1] == ["run"] and re.search(r" --seed[ =]\S+(,|\.\.)", " ".join(words)):
         raise removed("run --seed N..N")
     flags = [word.partition("=")[0] for word in words[1:]]
-    for row in REMOVED:
-        command, _, flag = row.name.partition(" ")
+    for name in REMOVED:
+        command, _, flag = name.partition(" ")
         if words[:1] == [command] and (not flag or flag in flags):
-            raise removed(row.name)
+            raise removed(name)

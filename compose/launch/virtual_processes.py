@@ -58,15 +58,6 @@ LEAST_WAIT_S = 1e-6
 """The least wait in s, so that rounding cannot make one without an end."""
 
 
-class VirtualEnd(NamedTuple):
-    """The end of a mission."""
-
-    kills: int
-    """The number of kills that took place."""
-    failures: tuple[str, ...]
-    """The errors with which processes ended, in their order."""
-
-
 class _Killed(BaseException):
     """The end of a killed process. It is no Exception, so nothing but the end of its thread handles it."""
 
@@ -85,14 +76,14 @@ def run_mission(
     folder: Path,
     kills: Sequence[Kill] = (),
     clocks: Mapping[str, ClockError] = MappingProxyType({}),
-) -> VirtualEnd:
-    """Run `scenario`, write its journals to `folder`, and return how it ended. Killed processes restart.
+) -> VirtualNetwork:
+    """Run `scenario`, write its journals to `folder`, and return the network. Killed processes restart.
 
     `clocks` are the errors of the clocks of robots and of the world, by name.
     """
     network = VirtualNetwork(scenario, folder, kills, clocks)
     network.run({WORLD: world_process} | {one.id: agent_process for one in scenario.robots})
-    return VirtualEnd(network.taken, tuple(network.failures))
+    return network
 
 
 class VirtualProcess:
@@ -186,7 +177,9 @@ class VirtualNetwork:
         self.now = 0.0
         self.over = False
         self.taken = 0
+        """The number of kills that took place."""
         self.failures: list[str] = []
+        """The errors with which processes ended, in their order."""
         self.ended: list[str] = []
         self.subscribers: list[tuple[VirtualLink, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
         self.watchers: list[tuple[VirtualLink, zenoh.KeyExpr, Callable[[_Sample], None]]] = []

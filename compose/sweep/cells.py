@@ -39,12 +39,6 @@ class Cell(msgspec.Struct, frozen=True):
         return f"{self.index:03d}.toml"
 
 
-class RefusedCell(msgspec.Struct, frozen=True):
-    """A cell whose scenario is infeasible."""
-
-    reason: str
-
-
 def cells(sweep: Sweep) -> Iterator[Cell]:
     """Yield the cells of `sweep` in order; the last axis varies fastest."""
     places = product(*[range(len(axis.values)) for axis in sweep.axes])
@@ -83,16 +77,16 @@ def label(sweep: Sweep, cell: Cell) -> str:
     return "; ".join(values) or "the only cell"
 
 
-def setting_of(sweep: Sweep, cell: Cell) -> ScenarioTemplate | RefusedCell:
-    """Return the validated scenario of the cell, or RefusedCell if it is infeasible.
+def setting_of(sweep: Sweep, cell: Cell) -> ScenarioTemplate:
+    """Return the validated scenario of the cell.
 
-    Raises BadScenario if a field is invalid.
+    Raises Unworkable, whose text is the reason alone, if it is infeasible, and BadScenario if it is invalid.
     """
     source = f"{sweep.source}: cell {cell.index} ({label(sweep, cell)})"
     try:
         return validate(cell.table, source)
     except Unworkable as error:
-        return RefusedCell(str(error).removeprefix(f"{source}: "))
+        raise Unworkable(str(error).removeprefix(f"{source}: ")) from None
 
 
 def trial_table(sweep: Sweep, cell: Cell, trial: int) -> dict[str, Any]:

@@ -11,11 +11,11 @@ import msgspec
 import numpy as np
 import pyarrow as pa
 
-from compose.errors import BadSpec
+from compose.errors import BadSpec, Unworkable
 from compose.recording.rows import csv_text
 from compose.scenario.scenario_file import trust_classes
 from compose.sweep import SUMMARY_CSV
-from compose.sweep.cells import Cell, RefusedCell, setting_of, trial_seed
+from compose.sweep.cells import Cell, setting_of, trial_seed
 from compose.sweep.paired_differences import PairedDifference, paired_differences
 from compose.sweep.results_folder import Folder, opened
 from compose.sweep.spec import Sweep
@@ -142,13 +142,14 @@ def _left(folder: Folder, means: ExecutionOptions, progress: Progress) -> list[C
         if not left or cell.index in refused:
             continue
         trust_classes(cell.table)  # of the user's sweep: a folder with another one is refused
-        setting = setting_of(sweep, cell)
-        if isinstance(setting, RefusedCell):
-            refused[cell.index] = setting.reason
-        else:
-            seeds = tuple([trial_seed(sweep.seed, cell.key, trial) for trial in left])
-            table = cell.table if sweep.draws else {}
-            work.append(Chunk(cell.index, tuple(left), seeds, setting, options, table))
+        try:
+            setting = setting_of(sweep, cell)
+        except Unworkable as error:
+            refused[cell.index] = str(error)
+            continue
+        seeds = tuple([trial_seed(sweep.seed, cell.key, trial) for trial in left])
+        table = cell.table if sweep.draws else {}
+        work.append(Chunk(cell.index, tuple(left), seeds, setting, options, table))
     if len(refused) == len(folder.cells):
         first, reason = next(iter(refused.items()))
         raise BadSpec(f"{sweep.source}: no cell can run; cell {first}: {reason}")

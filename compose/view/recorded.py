@@ -9,11 +9,11 @@ from msgspec.structs import replace
 from compose.errors import UserError
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal, robot_of
 from compose.recording.run import Run
-from compose.recording.run_setup import RunSetup
+from compose.recording.run_setup import RobotSetup, RunSetup
 from compose.view.captions import Caption
-from compose.view.reported import reported_paths
 from compose.view.run_data import RunData
 from compose.view.scene import Scene, scene
+from protocol.motion import Pose, compose, inverse
 
 
 def run_data(run: Run) -> RunData:
@@ -75,3 +75,35 @@ def checked(run: Run) -> tuple[Sequence[str], RunSetup]:
         )
     peers = [one.peer for one in setup.robots if one.peer is not None and run.world is None]
     return list(dict.fromkeys([*run.robots, *sorted(peers)])), setup
+
+
+# --- the paths that attackers report ----------------------------------------------------------------
+
+LAST_DRAWN_TICK = 100_000
+"""The largest tick up to which a path is computed: a frame may report any number of ticks."""
+
+
+def reported_paths(setup: RunSetup, known: RunData, last: int) -> dict[str, Sequence[Pose]]:
+    """Return the reported poses in <W> of each attacker, from tick 0 to at most `last`.
+
+    A path has the reported manoeuvres, from the reported start in the attacker's true anchor frame. There is
+    none without the ground truth of tick 0 or before the first report. Headings are not wrapped.
+    """
+    paths: dict[str, Sequence[Pose]] = {}
+    for robot in setup.robots:
+        start, log = _reported_start(robot, known), known.reported_logs.get(robot.id)
+        if start is not None and log is not None:
+            end = min(last, log.through, LAST_DRAWN_TICK)
+            paths[robot.id] = log.track(start, 0, end, setup.mission.period)
+    return paths
+
+
+def _reported_start(robot: RobotSetup, known: RunData) -> Pose | None:
+    first = known.ticks.get(0)
+    true = first.truth.get(robot.id) if first is not None else None
+    if robot.attack is None or robot.frame is None or true is None:
+        return None
+    from agent.peer import false_reports  # noqa: PLC0415  # the agent's code, for attackers only
+
+    local = compose(inverse(robot.frame), true)
+    return compose(robot.frame, false_reports.start(local, robot.attack))

@@ -222,20 +222,14 @@ def _increments(
 # --- writing ------------------------------------------------------------------------------------------------
 
 
-class WrittenGraph(NamedTuple):
-    """A recording in the text format, and the names that its radios have there."""
-
-    text: str
-    names: dict[str, str]
-    """The names in the file of all robots and anchors, by their names in the recording."""
-
-
 LETTERS = "ABCDEFGHIJKMNOPQRSTUVWXYZ"
 """The names that robots can have. L is that of landmarks."""
 
 
-def written_pyfg(recording: RangeRecording) -> WrittenGraph:
-    """Return the `recording` of a run as text, with every number in its shortest exact form.
+def written_pyfg(recording: RangeRecording) -> tuple[str, dict[str, str]]:
+    """Return the `recording` of a run as text, and the names in it of all robots and anchors, by their own.
+
+    Every number has its shortest exact form.
 
     Poses are numbered from 0, and each needs a true pose. Raises UserError if there is none, and for more
     than 25 robots.
@@ -264,7 +258,7 @@ def written_pyfg(recording: RangeRecording) -> WrittenGraph:
             for name in (radios[first], radios[second])
         ]
         edges.append(f"EDGE_RANGE {_plain(t)} {' '.join(ends)} {_plain(measured, sigma * sigma)}")
-    return WrittenGraph("\n".join([*lines, *edges, ""]), names)
+    return "\n".join([*lines, *edges, ""]), names
 
 
 UPPER_TRIANGLE = np.triu_indices(3)

@@ -6,7 +6,6 @@ import base64
 import html
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import msgspec
 
@@ -23,16 +22,11 @@ IMPORTED = re.compile(r'from "\./([a-z]+\.js)"')
 """An import of another module of the page. In one file, modules have no addresses relative to each other."""
 
 
-class StandalonePage(NamedTuple):
-    """The content of the file."""
+def standalone_page(folder: Path) -> tuple[str, list[str]]:
+    """Return the page of the recording in `folder` as HTML, and a line for each part that cannot be read.
 
-    html: str
-    notes: list[str]
-    """One line for each part of the recording that cannot be read."""
-
-
-def standalone_page(folder: Path) -> StandalonePage:
-    """Return the page of the recording in `folder`. Raises UserError if there is not exactly one."""
+    Raises UserError if there is not exactly one recording.
+    """
     site = of_folder(folder)
     shows = site.shows
     if site.folder is not None or len(shows) != 1:
@@ -47,7 +41,7 @@ def standalone_page(folder: Path) -> StandalonePage:
         "scenes": scenes(show.setup, show.known),
         "series": series(show.setup, show.known, show.mission["first"], show.mission["last"]),
     }
-    return StandalonePage(_page(show.setup.name, msgspec.json.encode(recording).decode()), site.notes)
+    return _page(show.setup.name, msgspec.json.encode(recording).decode()), site.notes
 
 
 def _page(title: str, recording: str) -> str:
