@@ -30,7 +30,8 @@ from mcap.reader import make_reader
 from mcap.writer import Writer
 from mcap_protobuf.decoder import DecoderFactory
 
-from compose.cli import export_files, run
+from compose.cli import export as export_command
+from compose.cli import run
 from compose.cli.main import parse
 from compose.launch import in_process
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
@@ -472,7 +473,7 @@ def test_a_run_exports_its_recording_at_its_end(mode: list[str], paper_1: Path, 
 def test_a_run_that_cannot_export_prints_its_outcome(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(export_files, "EXPORT_MODULES", ("no_such_module",))
+    monkeypatch.setattr(export_command, "EXPORT_MODULES", ("no_such_module",))
     monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
     for quiet, said in ((True, ""), (False, "tandem run: not exported: needs no_such_module")):
         words = ["run", "paper-1", "--in-process", "--out", str(tmp_path / str(quiet)), *["-q"] * quiet]
@@ -567,7 +568,7 @@ def test_a_run_with_an_export_reads_its_recording_once(
 
     monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
     monkeypatch.setattr(run, "read", counted)
-    monkeypatch.setattr(export_files, "read_noted", counted)
+    monkeypatch.setattr(run, "read_noted", counted)
     assert run.main(parse(["run", "paper-1", "-q", "--out", str(tmp_path)])) == 0
     assert (tmp_path / "run.mcap").exists()
     assert len(found) == 1

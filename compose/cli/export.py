@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import argparse
+import gc
+from collections.abc import Callable
 from pathlib import Path
 
-from compose.cli.export_files import EXPORT_MODULES, exported
 from compose.cli.recording import note, read_noted
 from compose.errors import ENDED, FAILED, UserError, writing
 from compose.extras import need
 from compose.recording import recording_files
+from compose.recording.run import Run
+from compose.terminal.outcome import counting
 from compose.terminal.text_width import tell
 from protocol import files
 from protocol.output import say
+
+EXPORT_MODULES = ("foxglove", "pyarrow")
+"""The optional libraries that an export of all files needs; the caller checks that they are installed."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -27,11 +33,34 @@ def main(options: argparse.Namespace) -> int:
             write(options.recording, out)
             return ENDED
     need(*EXPORT_MODULES)
-    done = exported(options.recording, out)
-    say(*map(str, done.files))
-    note("export", [f"{name} ends with {size} bytes of a torn write" for name, size in done.torn.items()])
-    note("export", [f"{name} is missing" for name in done.missing])
-    return FAILED if done.missing else ENDED
+    from compose.view.export.folder import FILES  # noqa: PLC0415  # slow to import, and optional
+    from compose.view.recorded import checked  # noqa: PLC0415
+
+    with recording_files.user_errors(options.recording):
+        run = read_noted(options.recording, "export")
+    exported(run, options.recording, out)
+    say(*[str(out / name) for name in FILES])
+    torn = {name: one.torn for name, one in run.journals.items() if one.torn}
+    note("export", [f"{name} ends with {size} bytes of a torn write" for name, size in torn.items()])
+    names = [recording_files.agent_journal(robot) for robot in checked(run)[0]]
+    missing = [name for name in names if name not in run.journals]
+    note("export", [f"{name} is missing" for name in missing])
+    return FAILED if missing else ENDED
+
+
+def exported(
+    run: Run, folder: Path, out: Path, check: Callable[[], object] = lambda: None, *, quiet: bool = False
+) -> None:
+    """Export `run`, the recording in `folder`, to `out`, with a progress bar unless `quiet`.
+
+    `check` is called repeatedly, and may raise an exception to end the export. Raises UserError if a file
+    cannot be read or written.
+    """
+    from compose.view.export.folder import FILES, export  # noqa: PLC0415  # slow to import, and optional
+
+    with recording_files.user_errors(folder), counting("export", 0 if quiet else len(FILES)) as done:
+        gc.freeze()  # else each garbage collection goes through all messages again
+        export(run, out, done=done, check=check)
 
 
 def _pyfg(recording: Path, out: Path) -> None:

@@ -9,14 +9,15 @@ from collections.abc import Iterator, Mapping
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 from pathlib import Path
 
-from compose.cli import export_files
+from compose.cli import export
+from compose.cli.recording import read_noted
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.extras import need
 from compose.launch import processes, supervisor
 from compose.launch.page_process import PageProcess, serving
 from compose.launch.signals import INTERRUPTION, stop_by_signal
 from compose.recording.kills_file import KILLS
-from compose.recording.recording_files import folder_for, not_recorded
+from compose.recording.recording_files import folder_for, not_recorded, user_errors
 from compose.recording.run import Run, read
 from compose.recording.summary_json import Mode
 from compose.scenario.kills import Kill
@@ -40,7 +41,7 @@ def main(options: argparse.Namespace) -> int:
     if options.port is not None and not options.watch:
         raise UserError("--port: it needs --watch, which serves the page")
     if options.export:
-        need(*export_files.EXPORT_MODULES)
+        need(*export.EXPORT_MODULES)
         if options.out is None:
             raise UserError("--export: it needs --out DIR")
     kills = found.kills(scenario.seed, options.kill)
@@ -171,13 +172,15 @@ def _export(options: argparse.Namespace, folder: Path, inbox: Inbox, run: Run | 
     if options.out is None or options.export is False:
         return False
     try:
-        need(*export_files.EXPORT_MODULES)
+        need(*export.EXPORT_MODULES)
     except UserError as error:
         if not options.quiet:  # the export was not requested
             inbox.say(f"not exported: {error}")
         return False
     try:
-        export_files.exported(folder, folder, lambda: inbox.next(0.0), run=run, quiet=options.quiet)
+        with user_errors(folder):
+            whole = run or read_noted(folder, "export")
+        export.exported(whole, folder, folder, lambda: inbox.next(0.0), quiet=options.quiet)
     except UserError as error:
         inbox.say(f"not exported: {error}")
         return False

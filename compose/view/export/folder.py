@@ -5,11 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
-import msgspec
-
 from compose.errors import CannotWrite, UserError
 from compose.recording.frames import in_time
-from compose.recording.recording_files import agent_journal, make_folder
+from compose.recording.recording_files import make_folder
 from compose.recording.rows import MessageRow, TickRow, csv_text, message_rows, tick_rows
 from compose.recording.run import Run
 from compose.view.export.parquet import write_ticks
@@ -17,18 +15,6 @@ from compose.view.foxglove.layout import layout
 from compose.view.foxglove.mcap import TooLong, mcap
 from compose.view.recorded import checked, scenes_of
 from protocol import files
-
-
-class Exported(msgspec.Struct, frozen=True):
-    """The result of an export."""
-
-    files: tuple[Path, ...]
-    """The written files."""
-    torn: dict[str, int]
-    """The size in bytes of an incomplete last frame, by the journal's name; only journals that have one."""
-    missing: tuple[str, ...]
-    """The names of missing robot journals."""
-
 
 FILES = ("run.mcap", "run.foxglove.json", "frames.csv", "ticks.csv", "ticks.parquet")
 
@@ -39,14 +25,14 @@ def export(
     *,
     done: Callable[[], object] = lambda: None,
     check: Callable[[], object] = lambda: None,
-) -> Exported:
-    """Write the files for `run` to `out`.
+) -> None:
+    """Write FILES for `run` to `out`.
 
     Calls `done` after each file, and `check` between steps, which may raise.
     Raises OSError or CorruptJournal if a journal cannot be read to its end, UserError if there is no
     configuration, the run is too long for a format or `out` cannot be written.
     """
-    robots, setup = checked(run)
+    _, setup = checked(run)
     check()
     frames = in_time(run)
     ticks = list(tick_rows(run))
@@ -70,9 +56,3 @@ def export(
         raise CannotWrite(out, error) from None
     except TooLong as error:
         raise UserError(str(error)) from None
-    names = [agent_journal(robot) for robot in robots]
-    return Exported(
-        files=paths,
-        torn={name: journal.torn for name, journal in run.journals.items() if journal.torn},
-        missing=tuple([name for name in names if name not in run.journals]),
-    )
