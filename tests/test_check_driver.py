@@ -10,6 +10,7 @@ from compose.hardware.conformance import check_results
 from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import config_of
 from compose.scenario.scenario_file import load, parse
+from compose.terminal.finding import WRONG
 from tests import broken_drivers, virtual_time
 from tests.commands import tandem
 from tests.test_group_field import FAR
@@ -54,7 +55,7 @@ def test_a_broken_driver_is_reported_with_what_it_violates(
     driver = getattr(broken_drivers, broken)(CONFIG, MANOEUVRE_S)
     trial = ExerciseRun(driver, CONFIG, MANOEUVRE_S)
     trial.go_through()
-    assert said in "; ".join([one.wrong for one in check_results(trial) if one.wrong is not None])
+    assert said in "; ".join([one.text for one in check_results(trial) if one.mark == WRONG])
 
 
 def test_a_driver_of_a_group_is_checked_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,8 +66,8 @@ def test_a_driver_of_a_group_is_checked_as_well(monkeypatch: pytest.MonkeyPatch)
     driver = broken_drivers.RangesToOthersBeyondReach(config, MANOEUVRE_S)
     trial = ExerciseRun(driver, config, MANOEUVRE_S)
     trial.go_through()
-    found = [one.wrong for one in check_results(trial) if one.wrong is not None]
-    assert found == ["tick 4: 3.5 m to c, beyond R = 3 m"]
+    (found,) = [one.text for one in check_results(trial) if one.mark == WRONG]
+    assert found.endswith(": tick 4: 3.5 m to c, beyond R = 3 m")
 
 
 def test_a_range_to_a_robot_that_is_not_in_the_group_ends_the_exercise() -> None:

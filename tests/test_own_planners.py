@@ -34,6 +34,7 @@ from compose.recording import run as recorded
 from compose.recording.run import read
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import ScenarioTemplate, load, setting, validate
+from compose.terminal.finding import WRONG
 from protocol.messages import (
     MAX_BODY_BYTES,
     Cause,
@@ -299,9 +300,9 @@ BROKEN = {
 def test_check_planner_finds_each_mistake_for_its_own_reason(name: str) -> None:
     check, why = BROKEN[name]
     checks = check_planner(own(name).scenario, QuietInbox("test"))
-    wrong = next(one for one in checks if one.wrong is not None)
-    assert wrong.what.startswith(check)
-    assert why in str(wrong.wrong)
+    wrong = next(one for one in checks if one.mark == WRONG)
+    assert wrong.text.startswith(check)
+    assert why in wrong.text
 
 
 def test_check_planner_says_why_processes_did_not_complete_the_mission(
@@ -317,9 +318,9 @@ def test_check_planner_says_why_processes_did_not_complete_the_mission(
     monkeypatch.setattr(processes, "run_mission", without_answer)
     monkeypatch.setattr(recorded, "read", lambda _: SimpleNamespace(end=end))
     checks = check_planner(own("Sound").scenario, QuietInbox("test"))
-    wrong = next(one for one in checks if one.wrong is not None)
-    assert wrong.what == "it decides the same as processes over the network"
-    assert str(wrong.wrong) == "the mission failed: no answer from b at tick 17 for 30 s"
+    wrong = next(one for one in checks if one.mark == WRONG)
+    rule, why = "it decides the same as processes over the network", "no answer from b at tick 17 for 30 s"
+    assert wrong.text == f"{rule}: the mission failed: {why}"
 
 
 @pytest.mark.parametrize("name", series([OWN, "assured", "paper"]))
@@ -393,7 +394,7 @@ def test_such_a_group_is_localised_though_reports_are_lost_and_late() -> None:
 @pytest.mark.long
 def test_such_a_group_of_processes_that_are_killed_decides_the_same() -> None:
     checks = list(check_planner(believing(4, 1), QuietInbox("test")))
-    assert [one for one in checks if one.wrong is not None] == []
+    assert [one for one in checks if one.mark == WRONG] == []
 
 
 @pytest.mark.parametrize(

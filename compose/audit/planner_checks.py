@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple
+from typing import Any
 
 from agent.planning.planner import Planner
 from compose.audit.planner_probe import BreaksContract, HostilityProbe, PurityProbe, Watched
@@ -20,6 +20,7 @@ from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run
 from compose.scenario.kills import KILL_POINTS, Kill, parse
 from compose.scenario.run_settings import run_name
+from compose.terminal.finding import Finding, checked, ok
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.messages import RobotConfig
 from protocol.network.inbox import Inbox
@@ -36,19 +37,10 @@ class QuietInbox(Inbox):
         """Print nothing."""
 
 
-class Check(NamedTuple):
-    """The result of one check."""
-
-    what: str
-    """The rule of the contract."""
-    wrong: str | None = None
-    """The way in which the planner breaks it; None if it does not."""
-
-
 Journals = dict[str, list[bytes]]
 
 
-def check_planner(scenario: Scenario, inbox: Inbox) -> Iterator[Check]:
+def check_planner(scenario: Scenario, inbox: Inbox) -> Iterator[Finding]:
     """Yield the results of all checks of the planner of `scenario`, which has been loaded before.
 
     If it cannot complete the mission in one process, the checks after that one are left out.
@@ -57,22 +49,22 @@ def check_planner(scenario: Scenario, inbox: Inbox) -> Iterator[Check]:
     try:
         first, run = _journals(scenario)
     except UserError as error:
-        yield Check(what, str(error))
+        yield checked(what, str(error))
         return
-    yield Check(what)
-    yield Check("two runs in one process are the same", _other(first, _journals(scenario)[0]))
+    yield ok(what)
+    yield checked("two runs in one process are the same", _other(first, _journals(scenario)[0]))
     for rule, probe in (
         ("equal arguments give equal answers, and are not changed", PurityProbe),
         ("no report can make it fail", HostilityProbe),
     ):
-        yield Check(rule, _probed(scenario, probe))
-    yield Check("a verdict is final", _taken_back(run))
+        yield checked(rule, _probed(scenario, probe))
+    yield checked("a verdict is final", _taken_back(run))
     yield _audited(run)
     for rule, kills in (
         ("it decides the same as processes over the network", ()),
         ("killed processes resume and decide the same", _kills(scenario, run)),
     ):
-        yield Check(rule, _as_processes(scenario, first, kills, inbox))
+        yield checked(rule, _as_processes(scenario, first, kills, inbox))
 
 
 def _journals(
@@ -122,10 +114,10 @@ def _taken_back(run: Run) -> str | None:
     return None
 
 
-def _audited(run: Run) -> Check:
+def _audited(run: Run) -> Finding:
     what = f"the audit finds nothing (outcome: {run.end.outcome if run.end is not None else 'none'})"
     violations = audit_run(run).violations
-    return Check(what, violations[0].line if violations else None)
+    return checked(what, violations[0].line if violations else None)
 
 
 def _kills(scenario: Scenario, run: Run) -> tuple[Kill, ...]:

@@ -5,13 +5,11 @@ from __future__ import annotations
 import argparse
 from contextlib import closing
 
-from compose.errors import ENDED, VIOLATED, UserError
+from compose.errors import UserError
 from compose.hardware.conformance import check_results
 from compose.hardware.exercise import Broken, ExerciseRun
 from compose.launch.driver_loader import hardware_robot
-from compose.terminal import text_width
-from compose.terminal.text_width import tell
-from protocol.output import one_line, say
+from compose.terminal.finding import checked, tell_all
 
 
 def main(options: argparse.Namespace) -> int:
@@ -27,10 +25,5 @@ def main(options: argparse.Namespace) -> int:
             trial.go_through()
         except Broken as broken:
             where = trial.tries[-1].what if trial.tries else "the start"
-            tell(f"wrong  the exercise can be completed: after '{where}': {broken}")
-            return VIOLATED
-    found = check_results(trial)
-    for one in found:
-        line = f"wrong  {one.check}: {one.wrong}" if one.wrong else f"ok     {one.check}"
-        say(*text_width.wrapped(one_line(line), text_width.MARKED))
-    return VIOLATED if any(one.wrong for one in found) else ENDED
+            return tell_all([checked("the exercise can be completed", f"after '{where}': {broken}")])
+    return tell_all(check_results(trial))

@@ -4,11 +4,9 @@ from __future__ import annotations
 
 import argparse
 
-from compose.errors import ENDED, VIOLATED
 from compose.launch import supervisor
 from compose.scenario.scenario_file import setting
-from compose.terminal import text_width
-from protocol.output import one_line, say
+from compose.terminal.finding import tell_all
 
 
 def main(options: argparse.Namespace) -> int:
@@ -19,9 +17,4 @@ def main(options: argparse.Namespace) -> int:
     scenario = setting(options.mission, options.fault, options.planner, options.planner_option).seeded(
         options.seed
     )
-    failed = False
-    for one in check_planner(scenario, QuietInbox("tandem check-planner")):
-        line = f"wrong  {one.what}: {one.wrong}" if one.wrong else f"ok     {one.what}"
-        say(*text_width.wrapped(one_line(line), text_width.MARKED))
-        failed |= one.wrong is not None
-    return VIOLATED if failed else ENDED
+    return tell_all(check_planner(scenario, QuietInbox("tandem check-planner")))

@@ -14,8 +14,8 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from compose.doctor.finding import Finding, fix, ok
 from compose.network import KEYED
+from compose.terminal.finding import FIX, Finding, fix, ok
 from protocol.network import access_control
 from protocol.network.endpoints import Endpoints, is_encrypted, place
 
@@ -78,7 +78,7 @@ def _findings(files: CertificateSet, endpoints: Endpoints, now: float) -> Iterat
     yield _dated(f"certificate: {at}", shown, now)
     for authority in _context(ssl.PROTOCOL_TLS_CLIENT, files.authority).get_ca_certs():
         finding = _dated(f"authority: {files.authority}", authority, now)
-        if finding.mark != ok("").mark:
+        if finding.mark == FIX:
             yield finding
     yield from _named(files, name, endpoints)
     if not files.connects:

@@ -8,8 +8,8 @@ import socket
 from collections.abc import Iterator
 
 from compose import extras
-from compose.doctor.finding import Finding, fix, ok
 from compose.network import beyond
+from compose.terminal.finding import Finding, fix, ok
 from protocol import PACKAGE
 from protocol.files import error_text
 from protocol.network.endpoints import Endpoints, place

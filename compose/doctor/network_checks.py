@@ -11,8 +11,8 @@ import zenoh
 from msgspec.structs import replace
 
 from compose.doctor import running_missions
-from compose.doctor.finding import Finding, fix, ok, untried
 from compose.doctor.running_missions import ASK_S, Unreached, linked
+from compose.terminal.finding import Finding, fix, ok, untried
 from protocol.network import access_control, keys, session
 from protocol.network.endpoints import Endpoints, is_encrypted
 from protocol.wire import VERSION, version_of

@@ -9,13 +9,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from statistics import median
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares  # type: ignore[import-untyped]
 
 from compose.hardware.exercise import FIRST_HALF, SECOND_HALF, STOPPED_HALF_WAY, ExerciseRun, Try
+from compose.terminal.finding import Finding, checked
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from world.hardware.driver import SENSING
@@ -30,15 +30,6 @@ EXACT_TOLERANCE = 1e-6
 """The tolerance in m with which ranges without noise must agree with the path."""
 CONFORMING_SIGMAS = 6.0
 """The number of standard deviations by which ranges with noise may differ from the path."""
-
-
-class Found(NamedTuple):
-    """The result of a check."""
-
-    check: str
-    """Requirement that was checked."""
-    wrong: str | None
-    """Description of the error; None if there is none."""
 
 
 Check = Callable[[Mission, Sequence[Try]], str | None]
@@ -163,9 +154,9 @@ def reach(mission: Mission, tries: Sequence[Try]) -> str | None:
 CHECKS: tuple[Check, ...] = (prompt, stands, drives, lasts, stops, fresh, ranges, reach)
 
 
-def check_results(trial: ExerciseRun) -> list[Found]:
+def check_results(trial: ExerciseRun) -> list[Finding]:
     """Return the result of each check of an exercise."""
-    return [Found(str(check.__doc__), check(trial.config.mission, trial.tries)) for check in CHECKS]
+    return [checked(str(check.__doc__), check(trial.config.mission, trial.tries)) for check in CHECKS]
 
 
 def _text(controls: Controls) -> str:

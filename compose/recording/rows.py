@@ -307,9 +307,12 @@ def ticks_csv(run: recorded.Run) -> str:
 
 def csv_text(kind: type[msgspec.Struct], rows: Iterable[msgspec.Struct]) -> str:
     """Return `rows`, of type `kind`, as a CSV table; floats are in their shortest exact form."""
+    values = ([str(one).lower() if isinstance(one, bool) else one for one in astuple(row)] for row in rows)
+    return csv_table(kind.__struct_fields__, values)
+
+
+def csv_table(names: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """Return `rows` as a CSV table whose columns have these `names`."""
     out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    writer.writerow(kind.__struct_fields__)
-    for row in rows:
-        writer.writerow([str(one).lower() if isinstance(one, bool) else one for one in astuple(row)])
+    csv.writer(out, lineterminator="\n").writerows([names, *rows])
     return out.getvalue()

@@ -216,11 +216,8 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
         return replace(self, robots=tuple(robots)) if meetings else self
 
 
-def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | None = None) -> RunSetup:
-    """Return the static data that the world's journal holds.
-
-    `mode` and `tick_s` are not part of the scenario; see the fields of RunSetup.
-    """
+def of_scenario(scenario: Scenario, mode: str | None = None) -> RunSetup:
+    """Return the static data that the world's journal holds; the launch `mode` is not part of it."""
     team, planned = scenario.team, scenario.planned_sweep
     own_planner = scenario.planner_name not in RENDEZVOUS and not scenario.meetings
     return RunSetup(
@@ -232,7 +229,6 @@ def of_scenario(scenario: Scenario, mode: str | None = None, tick_s: float | Non
         max_ticks=scenario.max_ticks,
         seed=scenario.seed,
         mode=mode,
-        tick_s=tick_s,
         faults=scenario.faults,
         visits=tuple([Visit(one.visitor, one.visited, one.ends) for one in scenario.meetings]),
         sweep=planned.sweep if planned is not None else None,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -13,6 +11,7 @@ from matplotlib.figure import Figure
 
 from compose.errors import UserError
 from compose.figures.style import SWEEP_MEDIUM, look, save
+from compose.recording.rows import csv_table
 from compose.sweep import spec
 from compose.sweep.axis_figures import STYLES
 from compose.sweep.cells import Cell
@@ -71,11 +70,8 @@ def run(
         if results[-1].stopped is not None:
             break
     rows = [_row(one, cell) for one in results for cell in one.cells]
-    text = io.StringIO()
-    table = csv.DictWriter(text, rows[0], lineterminator="\n")
-    table.writeheader()
-    table.writerows(rows)
-    files.write(out / f"{ARENA}.csv", text.getvalue())
+    table = csv_table(rows[0], [row.values() for row in rows])
+    files.write(out / f"{ARENA}.csv", table)
     with look(SWEEP_MEDIUM):
         save(figure(rows), out / ARENA)
     return rows, results

@@ -3,8 +3,6 @@
 The annotations of CellSummary hold the functions that compute it, so they are evaluated here.
 """
 
-import csv
-import io
 import math
 from collections.abc import Callable, Mapping, Sequence
 from functools import partial
@@ -18,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.special import bdtr, gammainccinv, gammaincinv  # type: ignore[import-untyped]
 
 from compose.recording.claim_errors import DEGREES_OF_FREEDOM
+from compose.recording.rows import csv_table
 from compose.sweep.cells import Cell
 from compose.sweep.field_paths import canonical
 from compose.sweep.spec import Sweep
@@ -355,16 +354,13 @@ def column(table: pa.Table, name: str) -> Floats:
 
 def summary_csv(sweep: Sweep, cells: Sequence[Cell], figures: Mapping[int, CellSummary]) -> str:
     """Return the text of `summary.csv`, with one row per cell."""
-    out = io.StringIO()
-    rows = csv.writer(out, lineterminator="\n")
-    rows.writerow(header(sweep))
+    rows = []
     for cell in cells:
         axes = [
             value if isinstance(value, str | None) else canonical(value) for value in cell.on_axes(sweep.axes)
         ]
-        numbers = [getattr(figures[cell.index], name) for name in columns_of(sweep)]
-        rows.writerow([cell.index, *axes, *numbers])
-    return out.getvalue()
+        rows.append([cell.index, *axes, *[getattr(figures[cell.index], name) for name in columns_of(sweep)]])
+    return csv_table(header(sweep), rows)
 
 
 def header(sweep: Sweep) -> list[str]:

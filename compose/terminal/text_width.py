@@ -9,8 +9,6 @@ from collections.abc import Iterable
 from protocol import output
 from protocol.output import UNLIMITED, one_line, say
 
-MARKED = len("wrong  ")
-"""The width of the mark before each check of a planner or a driver."""
 FEWEST_COLUMNS = 20
 """The minimum number of columns beside an indent."""
 

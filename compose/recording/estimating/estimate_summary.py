@@ -26,6 +26,7 @@ from compose.recording.estimating.estimate_rows import (
 )
 from compose.recording.estimating.recorded_measurements import MeasuredRobot, Measurements, listed
 from compose.recording.estimating.recording_estimator import EpochFit, EstimateEpoch
+from compose.recording.rows import csv_table
 from protocol import files
 
 MOST_STRAYS, FEWEST_OF_ANCHOR = 0.5, 8
@@ -173,10 +174,9 @@ def write_estimate(folder: Path, rows: Sequence[PoseEstimateRow], summary: Estim
         "estimate.json": msgspec.json.format(msgspec.json.encode(summary), indent=2).decode() + "\n",
     }
     if summary.anchors:
-        texts["anchors.csv"] = "anchor,x,y,height,sigma\n" + "".join(
-            f"{name},{one.position[0]!r},{one.position[1]!r},{one.height!r},{one.sigma!r}\n"
-            for name, one in summary.anchors.items()
-        )
+        names = ("anchor", "x", "y", "height", "sigma")
+        anchors = [(name, *one.position, one.height, one.sigma) for name, one in summary.anchors.items()]
+        texts["anchors.csv"] = csv_table(names, anchors)
     for name, text in texts.items():
         files.write(folder / name, text)
     return [folder / name for name in texts]
