@@ -32,7 +32,6 @@ from compose.view.run_data import RunData
 from compose.view.scene import Scene
 from compose.view.series import series
 from compose.view.web.sources import Recorded
-from compose.view.web.thumbnail import thumbnail
 from protocol.journal import journal_file
 from protocol.journal.journal_file import packed
 from protocol.messages import (
@@ -235,7 +234,6 @@ def test_a_robot_outside_the_mission_changes_nothing_that_viewers_show(run: Run)
     for scene in scenes_told:
         list(views.of(scene))
     series(setup, told, 0, told.last)
-    thumbnail(setup, told)
 
 
 def test_configurations_alone_have_the_same_plan_of_meetings(run: Run) -> None:
@@ -437,7 +435,7 @@ def test_tandem_figures_draws_a_group_and_no_such_sheet_for_a_pair(folder: Path,
     assert (drawn.status, drawn.out, drawn.err) == (0, "", "")
 
 
-# --- terminal, Foxglove, thumbnail --------------------------------------------------------------------
+# --- terminal, Foxglove -------------------------------------------------------------------------------
 
 
 def test_the_table_has_the_tick_and_the_pose_of_each_claim_in_place_of_the_last_pose(
@@ -461,16 +459,12 @@ def test_the_line_of_a_mission_counts_robots_by_outcome(folder: Path, tmp_path: 
     assert line.display().plain.endswith(" at most: 4 localised, 4 no verdict yet")
 
 
-def test_localised_robots_have_another_colour_in_foxglove_and_in_pictures(
-    run: Run, shown: tuple[Scene, ...]
-) -> None:
+def test_localised_robots_have_another_colour_in_foxglove(run: Run, shown: tuple[Scene, ...]) -> None:
     setup = run.setup
     assert setup is not None
     assert [shown[75].player(robot.id).hue(robot) for robot in setup.robots] == [*"aaaabbbb"]
     stage = Views(setup).standing().message
     assert b"meetings" in stage.encode()
-    known = run_data(run)
-    assert thumbnail(setup, known).count("#c4451c") == 0
 
 
 # --- the page -----------------------------------------------------------------------------------------

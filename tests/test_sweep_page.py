@@ -1,9 +1,8 @@
-"""The page of a sweep: a map of its cells, from which the worst trial of a cell is played, and thumbnails."""
+"""The page of a sweep: a map of its cells, from which the worst trial of a cell is played."""
 
 from __future__ import annotations
 
 import json
-import re
 from pathlib import Path
 
 import pyarrow as pa
@@ -12,14 +11,8 @@ import pytest
 from playwright.sync_api import Route, expect
 
 from compose.errors import UserError
-from compose.launch import in_process
-from compose.recording.run import read
-from compose.scenario.scenario_file import load
-from compose.view.outlines import box
-from compose.view.recorded import run_data
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.reruns import Trials, over_time
-from compose.view.web.thumbnail import HEIGHT, WIDTH, thumbnail
 from tests.browser import Open, shot, watching
 from tests.commands import BOUND_S, TandemProcess
 
@@ -142,21 +135,3 @@ def test_a_cell_plays_its_worst_trial_at_once_and_leads_back(opened: Open, tmp_p
         page.locator("#home").click()
         expect(page.locator(".cell")).to_have_count(2)
         assert page.url == where
-
-
-@pytest.mark.long
-def test_a_thumbnail_ends_each_path_at_the_robots_last_pose_and_has_few_points(tmp_path: Path) -> None:
-    in_process.run_mission(load("far"), tmp_path)
-    run = read(tmp_path)
-    assert run.setup is not None
-    picture = thumbnail(run.setup, run_data(run))
-    assert len(picture) < 10_000
-    ends = re.findall(r'points="[^"]*?([-0-9.]+),([-0-9.]+)" .*?cx="([-0-9.]+)" cy="([-0-9.]+)"', picture)
-    assert [(x, y) for x, y, _, _ in ends] == [(x, y) for _, _, x, y in ends]
-    assert len(ends) == 2
-    last = run.ticks[-1].truth.poses
-    (a, b) = [(float(x), float(y)) for x, y, _, _ in ends]
-    shown = box(run.setup)
-    scale = min(WIDTH / shown.width, HEIGHT / shown.height) * 0.96
-    assert a[0] - b[0] == pytest.approx((last[0].x - last[1].x) * scale, abs=0.2)
-    assert a[1] - b[1] == pytest.approx((last[1].y - last[0].y) * scale, abs=0.2)

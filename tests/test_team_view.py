@@ -16,7 +16,6 @@ from compose.view.drawing import DARK, GREY, drawing, standing
 from compose.view.numbers import Numbers
 from compose.view.recorded import run_data, scenes
 from compose.view.scene import Scene
-from compose.view.web.thumbnail import thumbnail
 from tests.browser import Open, shot, until_shown, watching
 from tests.commands import tandem
 
@@ -158,15 +157,6 @@ def test_exports_draw_anchors_where_they_are_and_a_line_for_each_range(survey: P
         assert found == {one.id for one in run.setup.anchors}
         ranged = {one.anchor for one in player.anchors}
         assert {name for name in found if lines[f"robots/{player.robot}/range/{name}"]} == ranged
-
-
-def test_thumbnails_show_the_paths_of_teams(survey: Path, relative: Path) -> None:
-    for folder in (survey, relative):
-        run = read(folder)
-        assert run.setup is not None
-        picture = thumbnail(run.setup, run_data(run))
-        assert picture.count("<polyline") == len(run.robots)
-        assert "nan" not in picture
 
 
 # --- change and run -------------------------------------------------------------------------------------

@@ -37,7 +37,6 @@ from compose.view.web.origin import refusal
 from compose.view.web.site import Site
 from compose.view.web.sources import WatchedRun
 from compose.view.web.standalone import PAGE
-from compose.view.web.thumbnail import thumbnail
 from protocol import documents
 
 LOOPBACK = "127.0.0.1"
@@ -177,10 +176,6 @@ class _Answers:
             show.known.add_costs(await asyncio.to_thread(self._site.costs_of, show))
         show.revised()
 
-    async def thumbnail(self, request: Request) -> Response:
-        show, setup = self._show(request)
-        return Response(thumbnail(setup, show.known), media_type="image/svg+xml")
-
     async def scenes(self, request: Request) -> Response:
         show, setup = self._show(request)
         first = _number(request, "from", 0)
@@ -264,7 +259,6 @@ def application(site: Site) -> Starlette:
             Route("/api/shows/{name}/changed", answers.run_changed, methods=["POST"]),
             Route("/api/shows/{name}/changed.toml", answers.changed_file, methods=["POST"]),
             Route("/api/shows/{name}/series", answers.series),
-            Route("/api/shows/{name}/thumbnail", answers.thumbnail),
             Route(NEWS, answers.news),
             Mount("/page", StaticFiles(directory=PAGE)),
         ],

@@ -1,18 +1,19 @@
 // The list of missions, if the server has several, and the state of a mission in a few words.
 
 import { make } from "./cards.js";
-import { outcome_chip, thumbnail } from "./thumbnail.js";
+import { outcome_chip, style } from "./outcome.js";
 import { plural } from "./words.js";
 
 /** Fills `root` with the missions of a server's list. */
 export function list_missions(root, { shows, network }) {
+  style();
   root.hidden = false;
   const where = network.map(({ endpoint, reached }) => `${endpoint}${reached ? "" : " (no router yet)"}`);
   root.replaceChildren(
     ...(where.length ? [make("p", { className: "note", textContent: `Listening on ${where.join(", ")}.` })] : []),
     make("ul", {}, ...shows.map((one) => {
       const link = make("a", { href: `#show=${encodeURIComponent(one.name)}` },
-        thumbnail(one.name), make("b", { textContent: one.name }), " ",
+        make("b", { textContent: one.name }), " ",
         ...(one.title !== one.name ? [make("span", { textContent: one.title }), " "] : []),
         make("span", { textContent: plural(one.robots, "robot") }), " ",
         outcome_chip(one.end?.outcome, state_of(one.live, one.last, one.end)));

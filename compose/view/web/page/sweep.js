@@ -2,7 +2,7 @@
 
 import { make } from "./cards.js";
 import { add_time, heat_map } from "./heat.js";
-import { style } from "./thumbnail.js";
+import { style } from "./outcome.js";
 
 export async function sweep(root) {
   style();

@@ -1,14 +1,8 @@
-// The parts of a list of missions: a thumbnail of the paths, and the outcome with a sign of its own.
+// The outcome of a mission in a list, with a sign of its own.
 
 import { make } from "./cards.js";
 
 export const SIGNS = { localised: "★", undecided: "?", inconsistent: "≠", wrong: "✕", failed: "!" };
-
-/** Returns the picture of a mission's paths. */
-export function thumbnail(name) {
-  style();
-  return make("img", { className: "thumbnail", src: `/api/shows/${encodeURIComponent(name)}/thumbnail`, alt: "", loading: "lazy", width: 160, height: 100 });
-}
 
 /** Returns the state of a mission, with a sign if it has an outcome. */
 export function outcome_chip(outcome, state) {
