@@ -134,9 +134,13 @@ class NoEstimate(UserError):
     exit_status = NOT_LOCALISED
 
 
-def no_such(word: str, words: Collection[str]) -> str:
-    """Return the sentence for a `word` that is not one of `words`, with what there is."""
-    return f"there is no '{word}'; there are {', '.join(words)}{did_you_mean(word, words)}"
+def no_such(word: str, words: Collection[str], hint: str = "", what: str = "") -> str:
+    """Return the sentence for a `word` that is not one of `words`, with what there is.
+
+    It ends with the nearest word, or with `hint` if none is near. `what` is the noun before the word.
+    """
+    there = f"there is no {what}'{word}'; there are {', '.join(words)}"
+    return there + (did_you_mean(word, words) or hint)
 
 
 def status_of(outcome: Outcome) -> int:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
@@ -54,9 +53,7 @@ def distance(run: Run) -> Checks:
     least = run.scenario.mission.safety_distance
     if not least or not _as_told(run.scenario) or (found := nearest(run)) is None:
         return
-    begun = [
-        math.dist((one.x, one.y), (two.x, two.y)) for one, two in combinations(run.ticks[0].truth.poses, 2)
-    ]
+    begun = [travelled(*two) for two in combinations(run.ticks[0].truth.poses, 2)]
     least = min([least, *begun]) - LARGEST_ERROR_SIGMAS * run.scenario.mission.noise.mutual_sigma
     what = f"two robots came {found:.6g} m near, expected at least {least:.6g} m"
     near = found < least * (1.0 - TOUCHING)

@@ -18,7 +18,7 @@ from compose.figures.sheet import ANCHORS, LABEL, NO_ENCOUNTER, Absent, Sheet, c
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
 from protocol.mission import ROLES, Mission, Role
-from protocol.motion import ORIGIN, Pose, compose, inverse, step, travelled
+from protocol.motion import ORIGIN, Pose, compose, inverse, rotated, step, travelled
 
 WINDOW_MARGIN = 1.14
 """The half-width of the window, as a multiple of the largest distance from the robot that must be visible."""
@@ -65,8 +65,7 @@ class ManoeuvreView(NamedTuple):
 
     def turned(self, x: Array, y: Array) -> tuple[Array, Array]:
         """Rotate points of the anchor frame, in m, into this view."""
-        c, s = math.cos(self.spin), math.sin(self.spin)
-        return c * x - s * y, s * x + c * y
+        return rotated(math.cos(self.spin), math.sin(self.spin), x, y)
 
 
 def scene(plan: Plan) -> ManoeuvreView:

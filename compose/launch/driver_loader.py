@@ -6,13 +6,12 @@ import argparse
 from collections.abc import Callable
 from typing import NamedTuple
 
-from compose.errors import UserError, user_code
+from compose.errors import UserError, no_such, user_code
 from compose.launch.class_loader import named, trust
 from compose.scenario.run_settings import check_rate
 from compose.scenario.scenario_file import setting
 from protocol.messages import RobotConfig
 from protocol.network.clock import ClockError
-from protocol.spelling import did_you_mean
 from world.hardware.driver import THINKING, Driver
 from world.hardware.driver_journal import DriverHistory
 from world.scenario import Scenario
@@ -87,8 +86,7 @@ def mission(source: str, robot: str) -> Scenario:
     if scenario.deaths:
         raise UserError(f"{source}: dies: not available in hardware mode, in which no robot is simulated")
     if robot not in (ids := [placed.id for placed in scenario.robots]):
-        near = did_you_mean(robot, ids)
-        raise UserError(f"{source}: there is no robot '{robot}'; there are {', '.join(ids)}{near}")
+        raise UserError(f"{source}: {no_such(robot, ids, what='robot ')}")
     return scenario
 
 

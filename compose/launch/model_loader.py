@@ -5,9 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from compose.errors import FAILED, UserError, user_code
+from compose.errors import FAILED, UserError, no_such, user_code, within
 from compose.launch import class_loader
-from protocol.spelling import did_you_mean
 from world.radio_models import RADIO_MODELS
 from world.range_models import RANGE_MODELS
 from world.scenario import Scenario
@@ -30,13 +29,11 @@ def check(kind: str, spec: ModelSpec) -> None:
     if spec.model in shipped:
         maker = shipped[spec.model]
     elif ":" not in spec.model:
-        near = did_you_mean(spec.model, shipped) or "; a model of your own is MODULE:CLASS"
-        raise UserError(f"model: there is no '{spec.model}'; there are {', '.join(shipped)}{near}")
+        why = no_such(spec.model, shipped, "; a model of your own is MODULE:CLASS")
+        raise UserError(f"model: {why}")
     else:
-        try:
+        with within("model: ", UserError):
             maker = _loaded(spec.model)
-        except UserError as error:
-            raise UserError(f"model: {error}") from None
         if not issubclass(maker, contract):
             raise UserError(f"model: {spec.model} is not a subclass of tandem.models.{contract.__name__}")
     with user_code(f"options: {spec.model} cannot be created:"):

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
-from compose.errors import UserError, user_code, within
+from compose.errors import UserError, no_such, user_code, within
 from compose.launch.class_loader import GuardedSolver, entry_points, named
 from protocol.messages import RobotConfig
 from protocol.mission import Mission
 from protocol.orbits import RENDEZVOUS, Rendezvous, rendezvous
-from protocol.spelling import did_you_mean
 
 if TYPE_CHECKING:
     from agent.planning.planner import Planner
@@ -141,8 +140,7 @@ def planner_class(name: str) -> type[Planner[Any, Any]]:
         found = named(name, "planner", GROUP)
     except KeyError:
         names = [*PLANNER_NAMES, *installed()]
-        near = did_you_mean(name, names) or "; a planner of your own is MODULE:CLASS"
-        raise UserError(f"there is no '{name}'; there are {', '.join(names)}{near}") from None
+        raise UserError(no_such(name, names, "; a planner of your own is MODULE:CLASS")) from None
     if not isinstance(found, type) or not issubclass(found, Planner):
         raise UserError(f"{name}: is not a planner: not a subclass of tandem.planning.Planner")
     if hasattr(found, "suited"):

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from compose.recording.run import Run
-from protocol.motion import Pose, step
+from protocol.motion import Pose, step, travelled
 from world.truth import Truth
 
 INSTANTS = 32
@@ -30,7 +30,7 @@ def _of_pair(run: Run, pair: tuple[int, int]) -> float | None:
         if least is None and (mutual is None or mutual.range is None):
             continue
         paths = [_path(run, tick.truth, i) for i in pair]
-        apart = [math.hypot(one.x - other.x, one.y - other.y) for one, other in zip(*paths, strict=True)]
+        apart = map(travelled, *paths)
         least = min([*apart, least if least is not None else math.inf])
     return least
 

@@ -7,15 +7,13 @@ noise marginalised out.
 
 from __future__ import annotations
 
-import math
-
 import numpy as np
 
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.estimation.gaussian.reachable_accuracy import position_sigmas
 from compose.recording.run import Run
-from protocol.motion import REST, Pose
+from protocol.motion import REST, Pose, travelled
 from world.sensors import anchor_ranges
 
 
@@ -43,10 +41,10 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
         ranges = anchor_ranges(truth, scenario)
         for k, (place, anchor) in enumerate(zip(pair, anchors, strict=True)):
             if ranges[place]:
-                own[k].append((truth.tick, _apart(truth.poses[place], Pose(anchor.x, anchor.y, 0.0))))
+                own[k].append((truth.tick, travelled(truth.poses[place], Pose(anchor.x, anchor.y, 0.0))))
         contact = at.world.contacts.get((min(pair), max(pair)))
         if contact is not None and contact.range is not None:
-            mutual.append((truth.tick, _apart(truth.poses[pair[0]], truth.poses[pair[1]])))
+            mutual.append((truth.tick, travelled(truth.poses[pair[0]], truth.poses[pair[1]])))
     apart = (anchors[1].x - anchors[0].x, anchors[1].y - anchors[0].y)
     measured = near_anchors(
         [_driven(run, place, tick) for place in pair],
@@ -60,10 +58,6 @@ def position_bounds(run: Run, pair: tuple[int, int], tick: int) -> tuple[float, 
     relative = [(pose.x - anchors[0].x, pose.y - anchors[0].y, pose.heading) for pose in starts]
     a, b = position_sigmas(measured, np.array(relative))
     return a, b
-
-
-def _apart(one: Pose, other: Pose) -> float:
-    return math.hypot(one.x - other.x, one.y - other.y)
 
 
 def _driven(run: Run, place: int, tick: int) -> Track:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import platform
 from collections.abc import Mapping
 from functools import cache
@@ -21,7 +20,7 @@ from compose.recording.rows import parts, ticks_csv
 from compose.recording.run import Run
 from protocol import files
 from protocol.messages import FinalReport
-from protocol.motion import Pose, wrap
+from protocol.motion import Pose, travelled, wrap
 from world.referee import not_localised
 
 Mode = Literal["processes", "in-process"]
@@ -45,12 +44,7 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
         "first_contact_tick": first_contact(run),
         "t_max_s": scenario.t_max,
         "min_separation_m": min(
-            (
-                math.hypot(one.x - other.x, one.y - other.y)
-                for tick in ticks
-                for one, other in combinations(tick.truth.poses, 2)
-            ),
-            default=None,
+            (travelled(*two) for tick in ticks for two in combinations(tick.truth.poses, 2)), default=None
         ),
         "nearest_m": nearest(run) if scenario.mission.safety_distance else None,
         "parameters": {

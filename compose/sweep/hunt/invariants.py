@@ -16,6 +16,7 @@ from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run
 from compose.sweep.trial import Trial, row
 from protocol.messages import Inconsistent, Localised, Report
+from protocol.motion import travelled
 from world.faults import Fault
 from world.referee import errors
 from world.scenario import Scenario
@@ -61,8 +62,8 @@ def _guaranteed(scenario: Scenario) -> bool:
     fair = fair and not any(one.partition and not (one.ticks or one.contact_ticks) for one in scenario.faults)
     exact = scenario.mission.noise.exact and scenario.world_noise is None and scenario.range_model is None
     honest = all(one.attack is None for one in scenario.robots) and not scenario.deaths
-    places = [(one.start.x, one.start.y) for one in scenario.robots]
-    apart = min([math.dist(*ends) for ends in combinations(places, 2)], default=math.inf)
+    starts = [one.start for one in scenario.robots]
+    apart = min([travelled(*two) for two in combinations(starts, 2)], default=math.inf)
     if scenario.mission.safety_distance and apart <= scenario.mission.sensing_range:
         return False  # robots that begin in range of each other may block each other
     return fair and exact and honest and scenario.planner_name == "assured" and scenario.radio_model is None

@@ -79,7 +79,6 @@ class WorstTrial(NamedTuple):
     show: Recorded
     outcome: str
     trial: int
-    seed: int
 
 
 class Trials(Reruns):
@@ -196,10 +195,10 @@ def _changed(frame: bytes, change: bytes) -> ChangedScenario:
     return changed(scenario, documents.json_value(change, ScenarioChange), MOST_MISSION_TICKS)
 
 
-def run_worst(folder: str, cell: int, out: str) -> tuple[str, int, int]:
+def run_worst(folder: str, cell: int, out: str) -> tuple[str, int]:
     """Run the worst trial of `cell` of the sweep in `folder`, and write its journals to the folder `out`.
 
-    Return its outcome in the sweep, its index and its seed. Raises UserError.
+    Return its outcome in the sweep and its index. Raises UserError.
     """
     import pyarrow.parquet as pq  # noqa: PLC0415  # optional, and slow to import
 
@@ -224,7 +223,7 @@ def run_worst(folder: str, cell: int, out: str) -> tuple[str, int, int]:
         raise UserError(f"{folder} cannot be read: {error.strerror or error}") from None
     except (msgspec.MsgspecError, ValueError) as error:
         raise UserError(f"cell {cell} cannot be run: {error}") from None
-    return note.outcome, note.trial, note.seed
+    return note.outcome, note.trial
 
 
 def over_time(folder: str) -> dict[str, Any]:
