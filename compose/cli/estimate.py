@@ -18,10 +18,11 @@ from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEst
 from compose.recording.estimating.estimate_run import RecordingEstimate, StreamEstimate, estimated
 from compose.recording.estimating.estimate_summary import write_estimate
 from compose.recording.estimating.noise_files import told_noise
-from compose.recording.estimating.recorded_measurements import Measurements, listed, measurements
+from compose.recording.estimating.recorded_measurements import Measurements, measurements
 from compose.recording.estimating.true_poses import TRUTH_GAP_S
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import RecordedRobot
+from compose.recording.reasons import listed
 from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
 from compose.terminal.tables import shown

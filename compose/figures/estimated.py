@@ -18,8 +18,9 @@ from compose.figures.sheet import Sheet, around, entry
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.estimating.estimate_run import RecordingEstimate
-from compose.recording.estimating.recorded_measurements import Measurements, listed
+from compose.recording.estimating.recorded_measurements import Measurements
 from compose.recording.ranging.range_recording import Numbers, TruePath
+from compose.recording.reasons import listed
 from compose.view.colours import COLOURS
 from compose.view.outlines import OUTLINE_SIGMAS, Point, outline
 from protocol.mission import ROLES

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from protocol.messages import MAX_TEXT, Cause, MissionEnd, Outcome
 from protocol.output import one_line
 
-NAMED = 4
-"""The most robots that a clause names; the summary of a run has all of them."""
+NAMED, LISTED = 4, 8
+"""The most robots that a clause names, the summary of a run has all of them; the most names in a list."""
 
 
 def ended(end: MissionEnd | None, ticks: int) -> str:
@@ -51,9 +51,8 @@ def _clause(cause: Cause) -> str:
         case "max-ticks":
             return f"max_ticks: {robots} not localised by then"
         case "others":
-            more = len(cause.robots) - NAMED
-            names = ", ".join(cause.robots[:NAMED]) + (f" and {more} more" if more > 0 else "")
-            return f"{names} {'is' if len(cause.robots) == 1 else 'are'} not localised either"
+            verb = "is" if len(cause.robots) == 1 else "are"
+            return f"{listed(cause.robots, NAMED)} {verb} not localised either"
         case "waiting":
             return f"{robots} is localised"
         case "no-result":
@@ -91,3 +90,9 @@ def _time_is_up(robots: Sequence[str]) -> str:
     if len(robots) > NAMED:
         names = f"{len(robots)} robots"
     return f"the time is up, and {names} {'are' if len(robots) > 1 else 'is'} not localised"
+
+
+def listed(names: Sequence[str], most: int = LISTED, what: str = "more") -> str:
+    """Return `names` in one line: the first ones, `most` at most, and the number of the others."""
+    others = len(names) - most
+    return ", ".join(names[:most]) + (f" and {others} {what}" if others > 0 else "")

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
+from compose.recording.reasons import listed
 from compose.recording.summary_json import outcome_line
 from compose.terminal import tables, text_width
 from compose.terminal.text_width import tell
@@ -80,25 +81,20 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
         return f"all robots were localised by tick {last}; {bound}"
     if last is None:
         return f"no robot is localised; {bound}"
-    return f"all robots but {_named(left, 'robots')} were localised by tick {last}; {bound}"
+    return f"all robots but {listed(left, MOST_NAMED_ROBOTS)} were localised by tick {last}; {bound}"
 
 
 def _unverified(anchors: Sequence[str]) -> str:
     """Return the sentence on the anchors of which no range tells whether they stand elsewhere than told."""
-    named = _named(anchors, "anchors")
+    named = listed(anchors, MOST_NAMED_ROBOTS, "more anchors")
     return f"no range tells whether {named} stand elsewhere than told; summary.json has the directions"
-
-
-def _named(names: Sequence[str], what: str) -> str:
-    """Return at most MOST_NAMED_ROBOTS of `names`, and the number of further ones, which are `what`."""
-    more = len(names) - MOST_NAMED_ROBOTS
-    return ", ".join(names[:MOST_NAMED_ROBOTS]) + (f" and {more} more {what}" if more > 0 else "")
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
     """Return the sentence on missed deadlines: the number of each robot, and the advice."""
     worst = sorted(late.items(), key=lambda one: -one[1])
-    names = _named([f"{name} {missed}" for name, missed in worst], "robots")
+    missed = [f"{name} {ticks_missed}" for name, ticks_missed in worst]
+    names = listed(missed, MOST_NAMED_ROBOTS, "more robots")
     slower = f", such as --rate {rate / 2:g}," if rate is not None else ""
     return f"deadlines missed, of {ticks}: {names}; a lower --rate{slower} gives each robot more time"
 

@@ -24,8 +24,9 @@ from compose.recording.estimating.estimate_rows import (
     RobotEstimate,
     estimate_csv,
 )
-from compose.recording.estimating.recorded_measurements import MeasuredRobot, Measurements, listed
+from compose.recording.estimating.recorded_measurements import MeasuredRobot, Measurements
 from compose.recording.estimating.recording_estimator import EpochFit, EstimateEpoch
+from compose.recording.reasons import listed
 from compose.recording.rows import csv_table
 from protocol import files
 

@@ -34,6 +34,7 @@ from compose.recording.ranging.range_recording import (
     locked,
 )
 from compose.recording.ranging.range_steps import NEARLY_ALL, Flags, RangeSteps, speeds, steps_of
+from compose.recording.reasons import listed
 from protocol.noise import Noise
 
 EPOCH_S = 0.5
@@ -325,13 +326,3 @@ def _check_anchors(part: RangeRecording) -> None:
     ]
     who = "two robots need" if count == 2 else "one robot needs"
     raise NoAnchors(f"{part.source}: {who} ranges to two anchors at different places: " + ", ".join(heard))
-
-
-MOST_LISTED_ANCHORS = 8
-"""The largest number of names in a list for a user."""
-
-
-def listed(names: Sequence[str]) -> str:
-    """Return `names` in one line: the first MOST_LISTED_ANCHORS, and the number of the others."""
-    more = len(names) - MOST_LISTED_ANCHORS
-    return ", ".join(names[:MOST_LISTED_ANCHORS]) + (f" and {more} more" if more > 0 else "")
