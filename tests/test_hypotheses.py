@@ -35,17 +35,15 @@ from agent.estimation.gaussian.joint_ranges import (
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.placement_guesses import _encounter, placements
-from agent.estimation.gaussian.search import COARSE_STILL, _until_now, of_anchor, search, starts_about
+from agent.estimation.gaussian.search import _until_now, of_anchor, search, starts_about
 from agent.estimation.kernel import Kernel
 from agent.estimation.posterior import NO_HYPOTHESES, Hypothesis, Posterior, follow
 from agent.estimation.smoother import Singular
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Noise, VelocityNoise
 from tests.hypotheses_by_numpy import (
-    Residuals,
     anchors_by_numpy,
     detections_by_numpy,
-    likeliest,
     turned_by_numpy,
 )
 from tests.pair_starts import alone, kinds, pair_fit, with_ranges
@@ -307,32 +305,6 @@ def test_a_search_is_repeated_only_if_a_measurement_differs_in_a_bit() -> None:
     assert search(with_ranges(pair, rho=rho)) is not search(pair)
 
 
-def test_what_follows_from_a_hypothesis_is_computed_once_for_both_robots() -> None:
-    pair, _ = after_a_long_way(0)
-    again, _ = after_a_long_way(0)
-    ours, theirs = (inference.pair_planning_hypotheses(search(one).hypotheses) for one in (pair, again))
-    assert all(one is other for one, other in zip(ours, theirs, strict=True))
-    fitted = search(pair).hypotheses[0].fit
-    same = fitted._replace(poses=fitted.poses.copy())
-    assert (same, hash(same)) == (fitted, hash(fitted)), "a fit with the same numbers"
-    assert fitted != fitted._replace(level=2.0 * fitted.level)
-    assert fitted != fitted._replace(paths=fitted.paths + 1e-9)
-
-
-def test_a_followed_anchor_ends_after_one_linear_model_near_the_fit_of_all_steps() -> None:
-    draw, noise, count = np.random.default_rng(3), Noise(anchor_sigma=0.05, mutual_sigma=0.05), 20
-    path = track(draw.uniform(0.3, 0.8, count), draw.uniform(-1.0, 1.0, count), 1.0)
-    rho = np.hypot(path.x - 0.8, path.y + 0.5) + 0.05 * draw.normal(size=count + 1)
-    own = alone(path, rho.tolist(), noise)
-    held = of_anchor((), own.until(count - 1))
-    (followed, *_) = of_anchor(held, own)
-    (whole,) = fits(own, [held[0].fit.start])
-    sigmas = np.sqrt(np.diagonal(whole.of_start)[:2])
-    assert followed.fit.linear.poses.tolist() == held[0].fit.start.poses[0].tolist(), "no second linear model"
-    assert followed.fit.last_step < COARSE_STILL
-    assert np.max(np.abs(followed.fit.guess - whole.guess)[:2] / sigmas) < 0.01
-
-
 MIXTURES = {
     "exact odometry": RANGES,
     "outliers": Noise(0.05, 0.1, outliers=0.1, outlier_bias=(0.5, 2.0)),
@@ -382,20 +354,6 @@ def test_compiled_detections_are_those_of_their_text(drop_outs: float) -> None:
         assert detection_log_likelihoods(found, pair) == pytest.approx(by_text, rel=1e-12, abs=1e-12)
         told += sum(one < -0.1 for one in by_text)
     assert told > 4
-
-
-@pytest.mark.parametrize(("sigma", "left"), [(1e-9, 2), (1e-3, 1)])
-def test_two_placements_between_which_the_likelihood_falls_are_not_merged(sigma: float, left: int) -> None:
-    """In the limit of exact ranges, two placements may be a hundredth of a rad apart."""
-    pair, _ = after_a_long_way(0)
-    z = np.zeros((2, 8))
-    z[:, 0] = -0.005, 0.005
-
-    def residuals_at(z: Array) -> Residuals:
-        return Residuals(z[:, :1] ** 2 - 0.005**2, np.empty(0), np.zeros((len(z), 2)))
-
-    found, _ = likeliest(z, np.array([sigma]), residuals_at, np.ones(2), pair)
-    assert len(found) == left
 
 
 @given(st.integers(0, 40), st.lists(st.floats(-0.3, 0.3), min_size=3, max_size=3))

@@ -36,7 +36,7 @@ from agent.estimation.gaussian.odometry_noise import (
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.gaussian.search import starts_about
 from agent.estimation.problem import MOST_MEASURED_LENGTHS, Problem
-from protocol.motion import ORIGIN, Pose, compose, rotated, step
+from protocol.motion import ORIGIN, Pose, rotated, step
 from protocol.noise import Noise, VelocityNoise
 from tests.pair_starts import alone, kinds, m2, pair_fit, pair_start, with_ranges
 
@@ -261,16 +261,6 @@ def with_other_anchors(pair: JointMeasurements, seed: int) -> JointMeasurements:
     return with_ranges(pair, place=place, radio=np.arange(len(place)))
 
 
-@few
-@given(seeds)
-def test_the_true_start_predicts_the_true_ranges(seed: int) -> None:
-    pair, guess, poses = told(seed, EXACT)
-    found = pair_fit(guess, pair, Convergence(0))
-    assert found.guess == pytest.approx(guess, abs=1e-12)
-    assert found.residuals == pytest.approx(np.zeros(len(pair.ranges.rho)), abs=1e-12)
-    assert found.poses.ravel() == pytest.approx(poses, abs=1e-12)
-
-
 noises = st.builds(
     Noise,
     st.floats(1e-3, 0.05),
@@ -345,119 +335,6 @@ def test_exact_ranges_and_an_exact_odometry_give_the_truth(seed: int) -> None:
     assert found.poses.ravel() == pytest.approx(one.poses, abs=1e-9)
 
 
-@few
-@given(seeds)
-def test_one_robot_finds_its_anchor_and_holds_its_heading(seed: int) -> None:
-    one = told(seed, EXACT)
-    assume(clear(one))
-    (found,) = fits(one.pair.alone(0), starts_about([nudged(one, seed, 0.02)[:2]]))
-    assert found.guess == pytest.approx([*one.guess[:2], 0.0], abs=1e-9)
-    assert abs(found.start.poses[0, 2]) < 1e-30
-
-
-def patterns_of(told: Told) -> list[Array]:
-    """Return the effect of each constant error on v and omega, one sigma each, by its definition."""
-    priors = told.pair.noise.priors
-    patterns = []
-    for path in told.pair.paths:
-        still = np.zeros(K)
-        one_robot = [(priors.wheel_scale * path.v, still), (still, priors.wheel_scale * path.omega)]
-        patterns.append(np.array([*one_robot, (still, np.full(K, priors.gyro_bias))]))
-    return patterns
-
-
-def errors_of_ranges(told: Told) -> Array:
-    """Return the effect of one sigma of each bias, scale and slow error on each range; (N, unknowns)."""
-    priors, ranges, count = told.pair.noise.priors, told.pair.ranges, len(told.pair.ranges.rho)
-    kind = np.eye(3)[kinds(told.pair)]
-    apart = np.abs(ranges.tick[:, None] - ranges.tick) * told.pair.paths[0].period
-    together = (kind @ kind.T) * np.exp(-apart / priors.slow_time)
-    slow = priors.slow_sigma * np.linalg.cholesky(together + 1e-12 * np.eye(count))
-    common = np.full((count, 1), priors.range_bias)
-    return np.hstack((common, priors.range_scale * ranges.rho[:, None], priors.pair_bias * kind, slow))
-
-
-def information_of(told: Told, found: Fit) -> tuple[Array, Array, Array]:
-    """Return the Fisher information, the gradient of the log-posterior, and derivatives of the last poses.
-
-    All are numerical differences by all unknowns: the parameters, the white noise of the odometry, and each
-    error that is constant or slow, in its sigmas. Noise without variance is not an unknown.
-    """
-    pair, ranges = told.pair, told.pair.ranges
-    variance = np.concatenate([variances(pair.noise.odometry, path) for path in pair.paths])
-    free = variance > 0.0
-    patterns, of_ranges = patterns_of(told), errors_of_ranges(told)
-    errors = found.start.errors
-    noise = np.concatenate([white for error in errors for white in (error.v, error.omega)])
-    constants = np.concatenate([error.constant if len(error.constant) else np.zeros(3) for error in errors])
-    ends_of = np.cumsum((6, int(np.count_nonzero(free)), 6))
-
-    def seen(unknowns: Array) -> Array:
-        guess, some, constants, sizes = np.split(unknowns, ends_of)
-        moved = noise.copy()
-        moved[free] = some
-        paths = []
-        for path, by, pattern, size in zip(
-            pair.paths, moved.reshape(2, 2 * K), patterns, constants.reshape(2, 3), strict=True
-        ):
-            v, omega = by.reshape(2, K) + np.tensordot(size, pattern, 1)
-            paths.append(track(path.v + v, path.omega + omega, path.period))
-        lengths = distances(pair, guess, paths) + of_ranges @ sizes
-        ends = [end_of(path, guess[i : i + 3]) for path, i in zip(paths, (0, 3), strict=True)]
-        return np.concatenate((lengths, *ends))
-
-    weight = 1.0 / np.square(ranges.sigma)
-    prior = np.concatenate((np.zeros(6), 1.0 / variance[free], np.ones(6 + of_ranges.shape[1])))
-    known = np.concatenate((found.guess, noise[free], constants))
-    at = np.concatenate((known, np.zeros(of_ranges.shape[1])))
-    residuals = ranges.rho - seen(at)[: len(weight)]
-    # the ranges are linear in their own errors, whose most probable values therefore have a closed form
-    inner = (of_ranges.T * weight) @ of_ranges + np.eye(of_ranges.shape[1])
-    at[len(known) :] = np.linalg.solve(inner, of_ranges.T @ (weight * residuals))
-    by_ranges, by_poses = np.split(derivative(seen, at), [len(ranges.rho)])
-    residuals = ranges.rho - seen(at)[: len(weight)]
-    gradient = by_ranges.T @ (weight * residuals) - prior * np.concatenate((np.zeros(6), at[6:]))
-    return (by_ranges.T * weight) @ by_ranges + np.diag(prior), gradient, by_poses
-
-
-def end_of(path: Track, guess: Array) -> Array:
-    """Return the last pose, relative to the anchor."""
-    mx, my, turn = guess.tolist()
-    x, y, heading = float(path.x[-1]), float(path.y[-1]), float(path.heading[-1])
-    end = compose(Pose(0.0, 0.0, turn), Pose(x - mx, y - my, heading))
-    return np.array((end.x, end.y, end.heading))
-
-
-@few
-@given(seeds, noises)
-@pytest.mark.long
-def test_a_fit_ends_where_no_pose_and_no_error_of_the_odometry_is_likelier(seed: int, noise: Noise) -> None:
-    one = told(seed, noise)
-    assume(clear(one))
-    found = pair_fit(one.guess, one.pair)
-    assume(found.last_step < LAST_STEP)
-    information, gradient, _ = information_of(one, found)
-    covariance = np.linalg.inv(information)
-    left = (covariance @ gradient) / np.sqrt(np.diagonal(covariance))
-    assert np.max(np.abs(left)) < 0.2, "sigmas; among 2822 draws, the largest was 0.042"
-
-
-@few
-@given(seeds, noises)
-@pytest.mark.long
-def test_the_covariance_of_both_poses_is_that_of_all_unknowns_at_once(seed: int, noise: Noise) -> None:
-    one = told(seed, noise)
-    assume(clear(one))
-    found = settled(one)
-    assume(converged(found))
-    information, _, by_poses = information_of(one, found)
-    expected = found.level * by_poses @ np.linalg.solve(information, by_poses.T)
-    sigmas = np.sqrt(np.diagonal(expected))
-    assert found.covariance / np.outer(sigmas, sigmas) == pytest.approx(
-        expected / np.outer(sigmas, sigmas), abs=1e-4
-    )
-
-
 LOST = Noise(1e-3, 1e-3, odometry=VelocityNoise(omega=0.1, omega_floor=0.1)).as_told
 
 
@@ -471,19 +348,6 @@ def test_the_covariance_is_positive_where_ranges_leave_little_of_the_odometry_no
     covariance = pair_fit(nudged(one, seed, by), one.pair).covariance
     sigmas = np.sqrt(np.diagonal(covariance))
     assert np.min(np.linalg.eigvalsh(covariance / np.outer(sigmas, sigmas))) > -1e-9
-
-
-@few
-@given(seeds)
-def test_without_odometry_noise_the_covariance_is_the_inverse_of_the_ranges_information(seed: int) -> None:
-    one = told(seed, Noise(0.01, 0.03).as_told)
-    assume(clear(one))
-    found = settled(one)
-    by_guess = derivative(lambda guess: distances(one.pair, guess), found.guess)
-    information = by_guess.T @ np.diag(1.0 / np.square(one.pair.ranges.sigma)) @ by_guess
-    sigmas = np.sqrt(np.diagonal(np.linalg.inv(information)))
-    expected = np.linalg.inv(information) / np.outer(sigmas, sigmas)
-    assert found.of_start / np.outer(sigmas, sigmas) == pytest.approx(expected, abs=1e-5)
 
 
 def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:

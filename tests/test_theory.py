@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.closed_forms import placements
 from agent.estimation.exact import branches
-from protocol.motion import ORIGIN, TAU, Controls, Pose, compose, step, wrap
+from protocol.motion import ORIGIN, TAU, Controls, Pose, step, wrap
 
 Reals = NDArray[np.float64]
 Three = tuple[complex, complex, complex]
@@ -176,33 +176,6 @@ def off_the_line(odometry: Sequence[complex]) -> float:
 # --- one anchor: Proposition 1 ------------------------------------------------------------------------
 
 
-@given(st.builds(Pose, coordinates, coordinates, angles), st.lists(forwards, max_size=8), angles)
-def test_for_any_n_a_rotation_about_the_anchor_is_indistinguishable(
-    start: Pose, controls: list[Controls], beta: float
-) -> None:
-    """Proposition 1 (1)."""
-    truth, rotated = command(start, controls), command(compose(Pose(0.0, 0.0, beta), start), controls)
-    for one, other in zip(truth, rotated, strict=True):
-        assert abs(place(other)) == pytest.approx(abs(place(one)), abs=1e-12)
-        assert place(other) == pytest.approx(cmath.rect(1.0, beta) * place(one), abs=1e-12)
-
-
-@settings(max_examples=100)
-@given(st.floats(0.5, 3.0), angles, st.lists(forwards, min_size=2, max_size=6))
-@pytest.mark.long
-def test_three_points_or_more_that_are_not_collinear_leave_rotations_only(
-    rho0: float, heading: float, controls: list[Controls]
-) -> None:
-    """Proposition 1 is necessary too, and "any measurement beyond the third adds no further information"."""
-    odometry = [place(pose) for pose in command(ORIGIN, controls)]
-    assume(off_the_line(odometry) > 0.1)
-    rho = [abs(place(pose)) for pose in command(Pose(rho0, 0.0, heading), controls)]
-    found, is_complete = headings_that_fit(rho0, odometry, rho)
-    assume(is_complete)
-    assert len(found) == 1
-    assert wrap(found[0] - heading) == pytest.approx(0.0, abs=FITS)
-
-
 @settings(max_examples=100)
 @given(
     st.floats(0.5, 3.0),
@@ -238,25 +211,6 @@ def test_two_points_or_collinear_ones_leave_the_mirror_image_too_and_nothing_els
     assert len(closed) == 2
     for branch in closed:
         assert min(abs(wrap(branch.start.heading - phi)) for phi in found) < FITS
-
-
-@pytest.mark.parametrize(
-    ("half_turns", "classes"), [(0, 2), (1, 1), (2, 2), (3, 1), (4, 2), (-1, 1), (-2, 2)]
-)
-def test_a_third_range_distinguishes_the_branches_unless_omega_1_makes_full_turns(
-    half_turns: int, classes: int
-) -> None:
-    """Below eq. (3) the paper excludes omega_1 = j pi. Only omega_1 T_s = 2 j pi keeps q_2 on the line.
-
-    The line is that of q_0 and q_1. Half a turn distinguishes the branches, and Section IV allows it
-    (omega_max = pi).
-    """
-    controls = [Controls(1.0, 0.0), Controls(1.0, half_turns * math.pi / PERIOD)]
-    odometry = [place(pose) for pose in command(ORIGIN, controls)]
-    rho = [abs(place(pose)) for pose in command(Pose(2.0, 0.0, 1.2), controls)]
-    found, is_complete = headings_that_fit(2.0, odometry, rho)
-    assert is_complete
-    assert len(found) == classes
 
 
 # --- several anchors -------------------------------------------------------------------------------------
@@ -415,30 +369,3 @@ def test_both_bounds_are_reached(draw: Callable[..., Setting], same: bool, numbe
     counts = counted(draw, same=same)
     assert set(counts) == numbers
     assert counts.total() > 0.99 * DRAWS
-
-
-HERE, THERE, ASIDE = 1 + 2j, 3 - 1j, 4 + 0j
-
-
-@pytest.mark.parametrize(
-    ("p", "m", "family"),
-    [
-        ((HERE, THERE, 0j), (0j, 0j, ASIDE), lambda beta: (beta, 0j)),
-        ((0j, HERE, THERE), (0j, ASIDE, ASIDE), lambda beta: (beta, ASIDE)),
-        ((0j, HERE, THERE), (0j, HERE, THERE), lambda beta: (0.0, cmath.rect(4.0, beta))),
-    ],
-    ids=[
-        "the last point is on the first anchor",
-        "b stands on M_1",
-        "both moved alike, all ranges are equal",
-    ],
-)
-def test_the_bounds_hold_in_general_position_only(
-    p: Three,
-    m: Three,
-    family: Callable[[float], tuple[float, complex]],
-) -> None:
-    """The paper does not mention settings in which a whole circle of trajectories is indistinguishable."""
-    truth = Setting.of(p, m, *family(0.0))
-    for beta in (0.5, 1.0, 2.0, 4.0):
-        assert Setting.of(p, m, *family(beta)).rho == pytest.approx(truth.rho, abs=1e-12)
