@@ -9,16 +9,11 @@ from itertools import product
 from pathlib import Path
 from typing import NamedTuple
 
-import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import given
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement, same_placement
-from agent.estimation.exact import PairObservation, turn_error, weigh_placements
-from agent.estimation.mutual_ranges import base, solve
-from agent.estimation.precision import combined_error, odometry_rounding
 from agent.planning.assured import Assured
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS, TURN_RATES
 from agent.planning.state import RobotState
@@ -282,24 +277,6 @@ def test_ranges_before_phase_3_make_a_last_manoeuvre_needless() -> None:
     assert spared >= 15
 
 
-def test_observations_before_phase_3_rule_out_further_placements(tmp_path: Path) -> None:
-    more = 0
-    for seed in range(60):
-        claim = next(step for step in steps_of(tmp_path, CLOSE, seed) if step.commands["b"].verdict)
-        state = Assured().decide(claim.observed["b"], claim.heard["b"])
-        assert state.belief.encounter_tick is not None
-        late = state.pair_observations(state.belief.encounter_tick)
-        rounding_error = odometry_rounding(state, min(state.tick, state.peer_state.peer.through))
-        pair = base(late, rounding_error)
-        assert pair is not None
-        error_bound = combined_error(state.belief, rounding_error)
-        left = weigh_placements(solve(CLOSE.distance, pair), late, CLOSE.reach, error_bound)
-        (known,) = state.belief.placements
-        assert any(same_placement(known, one, 1e-6) for one in left), seed
-        more += len(left) > 1
-    assert more >= 6
-
-
 # --- no claim without a check -------------------------------------------------------------------------
 
 
@@ -349,14 +326,6 @@ def test_a_robot_that_drives_straight_out_of_range_drives_back_before_it_circles
     assert (1, *whole[:2]) in ways
     assert (3, *whole[:2]) in ways
     assert (1, *whole) in ways or setting not in (SECTION_IV, SLOW)
-
-
-def test_the_paper_planner_never_drives_back() -> None:
-    for seed in range(100):
-        recording = drawn(SECTION_IV, seed, "paper")
-        assert all(
-            command.task != "backing" for moment in recording.ticks for command in moment.commands.values()
-        )
 
 
 def known(recording: Run, robot: str) -> int:
@@ -457,119 +426,7 @@ coordinates = st.floats(-20.0, 20.0)
 poses = st.builds(Pose, coordinates, coordinates, angles)
 
 
-def sighted(placement: Placement, a: Pose, b: Pose) -> PairObservation:
-    there = placement.place(a)
-    return PairObservation(0, a, b, math.hypot(there.x - b.x, there.y - b.y))
-
-
-def ranges_of(
-    distance: float, phi: float, psi: float, pair_observations: list[PairObservation]
-) -> list[float]:
-    """Return the predicted ranges (m) with M1 at the bearing psi from M2 and <a(M1)> rotated by phi."""
-    placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
-    found = [sighted(placement, one.a, one.b).range for one in pair_observations if one.range is not None]
-    return [rho for rho in found if rho is not None]
-
-
-@given(st.floats(1.0, 40.0), angles, angles, st.lists(st.tuples(poses, poses), min_size=2, max_size=5))
-def test_turn_error_is_the_largest_rotation_error_of_least_squares(
-    distance: float, phi: float, psi: float, pairs: list[tuple[Pose, Pose]]
-) -> None:
-    placement = Placement(phi, distance * math.cos(psi), distance * math.sin(psi))
-    pair_observations = [sighted(placement, a, b) for a, b in pairs]
-    assume(all((one.range or 0.0) > 0.1 for one in pair_observations))
-    h = 1e-5
-    by_phi, by_psi = (
-        np.subtract(
-            ranges_of(distance, phi + h * turn, psi + h * (1 - turn), pair_observations),
-            ranges_of(distance, phi - h * turn, psi - h * (1 - turn), pair_observations),
-        )
-        / (2 * h)
-        for turn in (1, 0)
-    )
-    slopes = np.column_stack([by_phi, by_psi])
-    assume(np.linalg.cond(slopes) < 1e3)
-    fit = np.linalg.pinv(slopes)
-    sighted_all = [*pair_observations, PairObservation(0, Pose(1.0, 2.0, 3.0), ORIGIN, None)]
-    alone = [np.abs(turned).sum() for turned in (fit[0] - fit[1], fit[1])]
-    assert turn_error(placement, sighted_all, 1.0, 0.0) == pytest.approx(max(alone), rel=1e-3)
-    places = [placement.place(one.a) for one in pair_observations]
-    away = np.array(
-        [(there.x - one.b.x, there.y - one.b.y) for there, one in zip(places, pair_observations, strict=True)]
-    )
-    towards = away / np.linalg.norm(away, axis=1, keepdims=True)
-    together = [np.linalg.norm(turned @ towards) for turned in (fit[0] - fit[1], fit[1])]
-    assert turn_error(placement, sighted_all, 0.0, 1.0) == pytest.approx(max(together), rel=1e-3, abs=1e-6)
-
-
-GENERAL = Placement(0.7, -9.0, 4.0)
-OPEN = {
-    "b between the anchors": (
-        Placement(0.3, 10.0, 0.0),
-        [((4.0, 3.0), (8.0, 0.0)), ((5.0, 2.0), (8.0, 0.0))],
-    ),
-    "a went straight away from b": (
-        Placement(0.0, -9.0, 4.0),
-        [((11.0, -4.0), (0.0, 0.0)), ((10.0, -4.0), (0.0, 0.0))],
-    ),
-    "all in a line": (
-        Placement(0.0, -10.0, 0.0),
-        [((7.0, 0.0), (-0.3, 0.0)), ((8.0, 0.0), (-0.3, 0.0)), ((8.0, 0.0), (-1.0, 0.0))],
-    ),
-    "one range": (GENERAL, [((5.0, 1.0), (0.3, 0.1))]),
-}
-"""Placements that the ranges leave undetermined, such as double roots of eq. (7).
-
-Each case has a placement and the positions of a and b at each range.
-"""
-
-
-def seen_at(
-    placement: Placement, *places: tuple[tuple[float, float], tuple[float, float]]
-) -> list[PairObservation]:
-    return [sighted(placement, Pose(*a, 0.0), Pose(*b, 0.0)) for a, b in places]
-
-
-@pytest.mark.parametrize("case", OPEN)
-def test_ranges_that_leave_a_rotation_free_determine_no_placement(case: str) -> None:
-    placement, places = OPEN[case]
-    pair_observations = seen_at(placement, *places)
-    assert turn_error(placement, pair_observations, 1e-12, 1e-12) == math.inf
-
-
-def test_ranges_in_general_position_determine_a_placement() -> None:
-    pair_observations = seen_at(GENERAL, ((8.0, 3.0), (0.3, 0.2)), ((7.5, 4.0), (0.3, 0.2)))
-    assert turn_error(GENERAL, pair_observations, 1e-12, 1e-12) < 1e-10
-
-
-def test_one_more_range_from_another_place_determines_a_double_root() -> None:
-    placement, places = OPEN["b between the anchors"]
-    assert turn_error(placement, seen_at(placement, *places, ((5.0, 2.0), (8.0, 1.0))), 1e-12, 1e-12) < 1e-10
-
-
 # --- anywhere in the plane ----------------------------------------------------------------------------
-
-FRAMES = [
-    Pose(9e5, -9e5, 0.0),
-    Pose(-9e5, -9e5, 2.0),
-    Pose(9e5, 9e5, -2.5),
-    Pose(0.0, 0.0, math.pi / 2),
-    Pose(-1e4, 9e5, math.pi),
-    Pose(0.5, 0.25, 1.0),
-]
-
-
-@pytest.mark.parametrize("frame", FRAMES)
-def test_a_mission_is_the_same_wherever_in_the_plane_it_is(frame: Pose) -> None:
-    for setting, seed in product((SECTION_IV, CLOSE), range(8)):
-        here = drawn(setting, seed)
-        a, b = (robot.start for robot in here.scenario.robots)
-        there = released(setting, a, b, frame)
-        assert_localised(there)
-        assert len(there.ticks) == len(here.ticks), seed
-        for robot in "ab":
-            assert states(there, robot) == states(here, robot), seed
-
 
 # --- special starts -----------------------------------------------------------------------------------
 
@@ -667,40 +524,3 @@ def test_a_slow_turner_completes_phase_1_next_to_its_anchor(rho0: float) -> None
 @given(st.floats(0.1, 1.5), st.floats(0.05, 1.0), st.floats(0.2, math.pi))
 def test_ordinary_missions_are_feasible(ratio: float, period: float, turn_rate: float) -> None:
     assert infeasibility(Mission(10.0 * ratio, period, 1.0, turn_rate), 10.0) is None
-
-
-@pytest.mark.parametrize(
-    ("mission", "distance", "step"),
-    [
-        (Mission(3.0, 1e-3, 0.05, 1.0), 10.0, "5e-05 m"),
-        (Mission(3.0, 1e-5, 1.0, 1.0), 10.0, "1e-05 m"),
-        (Mission(3.0, 1.0, 9.9e-5, 1.0), 10.0, "9.9e-05 m"),
-    ],
-)
-def test_a_mission_whose_ticks_are_too_short_is_infeasible(
-    mission: Mission, distance: float, step: str
-) -> None:
-    why = infeasibility(mission, distance)
-    assert why is not None
-    assert f"a robot moves at most {step} in a tick" in why
-    assert why.endswith("raise max_speed or period")
-    assert infeasibility(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None
-
-
-@pytest.mark.parametrize(
-    ("mission", "distance", "named"),
-    [
-        (Mission(3.0, 0.05, 1.0, 1.0), 1000.0, ("1000 m", "3 m", "0.05 m")),
-        (Mission(3.0, 1.0, 1.0, 1.0), 2e3, ("2000 m", "3 m", "1 m")),
-        (Mission(300.0, 1.0, 0.3, 1.0), 10.0, ("10 m", "300 m", "0.3 m")),
-    ],
-)
-def test_a_mission_with_too_large_a_distance_is_infeasible(
-    mission: Mission, distance: float, named: tuple[str, str, str]
-) -> None:
-    why = infeasibility(mission, distance)
-    assert why is not None
-    between, reach, step = named
-    assert f"with {between} between the anchors and ranges up to {reach}, manoeuvres of {step} are" in why
-    assert why.endswith("raise max_speed or period")
-    assert infeasibility(replace(mission, max_speed=mission.max_speed * 1e3), distance) is None

@@ -6,13 +6,11 @@ import csv
 import json
 import math
 import re
-import warnings
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
@@ -20,9 +18,6 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.following import ClaimRule
-from agent.estimation.gaussian.measured_rows import near_anchors
-from agent.estimation.gaussian.odometry_noise import track
-from agent.estimation.problem import Problem
 from compose.cli import estimate as estimate_command
 from compose.cli.commands import COMMANDS
 from compose.cli.main import command_parser
@@ -50,7 +45,7 @@ from compose.view.played_estimate import PLAYER_JSON, read_player
 from compose.view.recorded import scenes as recorded_scenes
 from docs import recorded_claims
 from protocol.motion import Pose, step, travelled
-from protocol.noise import Noise, ProfileName, VelocityNoise
+from protocol.noise import ProfileName
 from tests.commands import tandem
 from tests.series import series
 
@@ -173,13 +168,6 @@ def test_between_true_poses_a_robot_is_on_the_arc_of_its_manoeuvre(
     assert found == pytest.approx((between.x, between.y, between.heading), abs=1e-9)
 
 
-@pytest.mark.long
-def test_equal_inputs_give_equal_bytes(sample: RangeRecording, of_sample: RecordingEstimate) -> None:
-    again = sample_estimates(sample)
-    assert estimate_csv(again.rows) == estimate_csv(of_sample.rows)
-    assert msgspec.json.encode(again.summary) == msgspec.json.encode(of_sample.summary)
-
-
 def test_an_estimate_uses_nothing_that_was_measured_later(
     sample: RangeRecording, of_sample: RecordingEstimate
 ) -> None:
@@ -190,12 +178,6 @@ def test_an_estimate_uses_nothing_that_was_measured_later(
     assert early
     assert max(row.t_s for row in early) <= begin + 15.2
     assert estimate_csv(early) == estimate_csv(of_sample.rows[: len(early)])
-
-
-def test_only_the_last_estimate_keeps_its_fit(of_sample: RecordingEstimate) -> None:
-    *earlier, last = of_sample.epochs
-    assert last.fitted is not None
-    assert all(epoch.fitted is None for epoch in earlier)
 
 
 def test_a_claim_waits_for_the_accuracy_that_is_asked_for(sample: RangeRecording) -> None:
@@ -259,21 +241,6 @@ def test_lateral_slip_is_followed() -> None:
         assert robot.final is not None
         assert robot.final.position_error_m is not None
         assert robot.final.position_error_m < 0.05
-
-
-def test_lateral_slip_turns_the_path_and_extra_variances_add_to_the_noise() -> None:
-    v, omega, noise = np.full(4, 1.0), np.zeros(4), Noise(0.1, 0.1, odometry=VelocityNoise(v_floor=0.1))
-    straight = track(v, omega, 1.0)
-    left = track(v, omega, 1.0, np.full(4, 0.5 * math.pi))
-    np.testing.assert_allclose(left.y, straight.x, atol=1e-12)
-    extra = np.array([[0.0, 0.0, 3.0, 0.0], [0.0, 2.0, 0.0, 0.0]])
-    plain, more = (
-        Problem.of(near_anchors([path], [[(1, 1.0), (3, 2.0)]], [(0.0, 0.0)], noise, 3.0)).measured
-        for path in (straight, left._replace(extra=extra))
-    )
-    np.testing.assert_allclose(more.white - plain.white, [extra])
-    np.testing.assert_array_equal(plain.slip, np.zeros((1, 4)))
-    np.testing.assert_array_equal(more.slip, [np.full(4, 0.5 * math.pi)])
 
 
 def test_measurements_that_differ_in_slip_variance_or_sigma_are_not_the_same(sample: RangeRecording) -> None:
@@ -384,16 +351,6 @@ def first_of(ranges: RangeSeries, count: int) -> RangeSeries:
     return RangeSeries(t[:count], first[:count], second[:count], lengths[:count], sigma[:count])
 
 
-@pytest.mark.long
-def test_ranges_of_zero_length_are_no_estimate_and_no_warning() -> None:
-    recording = simulated()
-    some = recording._replace(ranges=first_of(recording.ranges, 30))
-    with warnings.catch_warnings():
-        warnings.simplefilter("error", RuntimeWarning)
-        found = estimated(measurements(with_ranges(some, np.zeros(30)), None, "uwb", None), ClaimRule())
-    assert all(one.first_claim is None for one in found.summary.robots.values())
-
-
 def with_a_range_to_each(recording: RangeRecording, places: Sequence[tuple[float, float]]) -> RangeRecording:
     """Return `recording` with anchors at `places`, and one range of the first robot to each of them."""
     count, ranges = len(places), recording.ranges
@@ -428,29 +385,6 @@ def test_a_message_names_a_few_of_many_anchors() -> None:
 
 def position_sigma(pose: PoseEstimate) -> float:
     return math.sqrt(pose.covariance[0][0] + pose.covariance[1][1])
-
-
-@pytest.mark.long
-def test_poses_by_three_anchors_are_off_by_what_their_covariance_says() -> None:
-    """The mean of 2 x 10 values of NEES with 3 degrees of freedom is 3 +- 1.8 in 99.9 %."""
-    nees = []
-    for seed in range(10):
-        recording = with_third_anchor(simulated(), seed)
-        problem = measurements(recording, None, "uwb-calibrated", None)
-        found = estimated(problem, ClaimRule()).summary
-        nees += [one.final.nees for one in found.robots.values() if one.final and one.final.nees is not None]
-    assert len(nees) == 20
-    assert 1.0 < np.mean(nees) < 4.8
-
-
-def test_each_pair_of_radios_has_one_range_a_second_at_the_nearest_tick(sample: RangeRecording) -> None:
-    measured = measurements(sample, ("A", "B"), "uwb-calibrated", None)
-    ranges = measured.joint.ranges
-    t = measured.time_of(ranges.tick)
-    ticks = (t - measured.t0) / measured.joint.period
-    assert np.max(np.abs(ticks - ranges.tick)) <= 0.5 + 1e-6
-    for rows in ranges.pairs:
-        assert np.min(np.diff(t[rows])) >= EPOCH_S - measured.joint.period - 1e-6
 
 
 def test_known_errors_of_ranges_are_removed(sample: RangeRecording, tmp_path: Path) -> None:

@@ -44,29 +44,7 @@ CAP_SYS_ADMIN, CAP_SYS_RESOURCE = 21, 24
 """<linux/capability.h>"""
 PR_CAPBSET_DROP = 24
 """<sys/prctl.h>"""
-FAR_PAIR = (("c", "d", 0.0), ("d", "c", 400.0))
 NAMES = ("world", "agent a", "agent b")
-IMPORTS = """
-import sys
-import threading
-from msgspec.structs import replace
-from compose.cli import warm_up
-from compose.launch.in_process import run_mission
-from compose.scenario.scenario_file import load
-
-warm_up.missions()
-missions = [
-    replace(load(name), planner_name=planner)
-    for name in ("paper-1", "noisy")
-    for planner in ("paper", "assured")
-]
-imported = []
-sys.addaudithook(lambda event, values: imported.append(values[0]) if event == "import" else None)
-for mission in missions:
-    run_mission(mission)
-print([name for name in imported if name.startswith(("agent", "compose", "protocol", "world"))])
-"""
-"""The program that lists the modules that missions import after the warm-up of the fork server."""
 
 
 @pytest.fixture
@@ -145,21 +123,6 @@ def test_each_forked_process_has_its_own_status_and_output() -> None:
         server.close()
 
 
-def test_it_ends_with_its_standard_input() -> None:
-    server = ForkServer("compose.cli.warm_up:missions")
-    words = ("tandem", "agent", "a", "--connect", free_endpoint(), "--launched")
-    agent = server.start("compose.cli.main:main", *words)
-    agent.hang_up()
-    assert agent.wait(BOUND_S)
-    assert agent.status == 130
-    server.close()
-
-
-def test_a_forked_robot_imports_no_module_of_the_project() -> None:
-    listing = subprocess.run([sys.executable, "-c", IMPORTS], capture_output=True, text=True, check=True)
-    assert listing.stdout == "[]\n"
-
-
 # --- no process is left running -------------------------------------------------------------------------
 
 
@@ -202,21 +165,6 @@ def test_a_run_whose_fork_server_is_suspended_comes_to_its_end() -> None:
         ended = run.ended()
     assert ended.status in OVER
     assert "paper-1: " in ended.out
-
-
-def test_the_more_robots_a_run_starts_the_longer_each_looks_for_its_world(
-    endless: Path, tmp_path: Path
-) -> None:
-    out = tmp_path / "out"
-    others = (f'[[robot]]\nid = "{one}"\npeer = "{two}"\nanchor = [{x}, 90.0]\n' for one, two, x in FAR_PAIR)
-    mission = endless.read_text()
-    for one, two in (("a", "b"), ("b", "a")):
-        mission = mission.replace(f'id = "{one}"', f'id = "{one}"\npeer = "{two}"')
-    endless.write_text(mission + "".join(others))
-    with TandemProcess("run", endless, "--out", out, "-q") as run:
-        run.until_written(out / "agent-c.journal", 1)
-        words = processes_of(out)[process_of(out, "agent", "c")]
-    assert words[words.index("--connect-timeout") + 1] == "62.0"
 
 
 @pytest.mark.parametrize("server_too", [False, pytest.param(True, marks=ON_LINUX)])

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from agent.estimation.closed_forms import Placement, circle_intersections, included_angle, placements
 from agent.estimation.exact import PairObservation, branches, weigh_branches, weigh_placements
-from protocol.motion import TAU, Pose, Segment, chord, compose, follow, step, wrap
+from protocol.motion import Pose, Segment, chord, compose, follow, step, wrap
 
 EXACT = 1e-9
 FLOOR = 1e-7
@@ -56,13 +56,6 @@ def test_a_steps_chord_is_a_k_of_eq_1a(pose: Pose, v: float, omega: float, perio
     assert end.heading == pytest.approx(pose.heading + omega * period, abs=EXACT)
 
 
-@given(poses, speeds, turn_rates, periods)
-def test_the_same_arc_backwards_retraces_a_step(pose: Pose, v: float, omega: float, period: float) -> None:
-    back = step(step(pose, v, omega, period), -v, -omega, period)
-    assert apart(back, pose) < EXACT
-    assert back.heading == pytest.approx(pose.heading, abs=EXACT)
-
-
 @given(poses, st.floats(0.1, 10.0), st.floats(0.1, 10.0), periods)
 def test_a_step_is_an_arc_about_the_point_v_over_omega_to_the_left(
     pose: Pose, v: float, omega: float, period: float
@@ -85,13 +78,6 @@ def test_following_n_equal_ticks_is_n_steps(
     followed = follow(start, [Segment(ticks, v, omega)], period)
     assert apart(followed, end) < EXACT
     assert followed.heading == pytest.approx(end.heading, abs=EXACT)
-
-
-@given(poses, poses, poses)
-def test_composing_frames_is_associative(first: Pose, second: Pose, third: Pose) -> None:
-    left, right = compose(compose(first, second), third), compose(first, compose(second, third))
-    assert apart(left, right) < EXACT
-    assert left.heading == pytest.approx(right.heading, abs=EXACT)
 
 
 @given(poses, poses, speeds, turn_rates, periods)
@@ -161,15 +147,6 @@ def test_circle_intersections_lie_on_both_circles(x: float, y: float, radius: fl
         assert all(math.dist(point, (x, y)) == pytest.approx(radius, abs=EXACT) for point in found)
     elif room < -1e-5:
         assert found == []
-
-
-@given(angles, lengths, lengths)
-def test_touching_circles_meet_once(bearing: float, radius: float, distance: float) -> None:
-    apart = radius + distance
-    found = circle_intersections(apart * math.cos(bearing), apart * math.sin(bearing), radius, distance)
-    touch = (distance * math.cos(bearing), distance * math.sin(bearing))
-    assert 1 <= len(found) <= 2
-    assert all(math.dist(point, touch) < 1e-5 for point in found)
 
 
 def test_a_tangent_point_is_given_once() -> None:
@@ -351,45 +328,6 @@ def test_the_placements_are_all_different(encounter: Encounter) -> None:
 
 
 @given(encounters())
-def test_the_placements_are_the_same_whoever_counts_as_first(encounter: Encounter) -> None:
-    """Eq. (7) is symmetric in the two points of a."""
-    assume(encounter.is_tame)
-    swapped = placements(
-        encounter.distance, encounter.p1b, encounter.p2a, encounter.p1a, encounter.rho2, encounter.rho1
-    )
-    found = encounter.solutions()
-    assert len(found) == len(swapped)
-    assert all(nearest(swapped, placement) < 1e-8 for placement in found)
-
-
-@given(encounters())
-def test_a_turn_of_bs_frame_turns_every_placement_with_it(encounter: Encounter) -> None:
-    """If the frame of M2 is rotated by 1 rad, the solutions rotate with it."""
-    assume(encounter.is_tame)
-    frame = Pose(0.0, 0.0, 1.0)
-    rotated = placements(
-        encounter.distance,
-        compose(frame, encounter.p1b),
-        encounter.p1a,
-        encounter.p2a,
-        encounter.rho1,
-        encounter.rho2,
-    )
-    found = encounter.solutions()
-    assert len(found) == len(rotated)
-    for placement in found:
-        there = compose(frame, Pose(placement.x, placement.y, placement.phi))
-        assert nearest(rotated, Placement(there.heading, there.x, there.y)) < 1e-8
-
-
-@given(encounters())
-def test_a_tame_encounter_has_four_placements_or_two(encounter: Encounter) -> None:
-    """Each of +-alpha has two intersections or none. The circle of one sign may not intersect that of D."""
-    assume(encounter.is_tame)
-    assert len(encounter.solutions()) in (2, 3, 4)
-
-
-@given(encounters())
 def test_a_robot_that_met_its_peer_head_on_is_placed(encounter: Encounter) -> None:
     """With rho_1 = 0, a was at the position of b. The triangle is known from its other end."""
     truth, p1b, p2a = encounter.truth, encounter.p1b, encounter.p2a
@@ -474,39 +412,6 @@ def test_a_third_range_leaves_the_true_placement_as_it_was(
         )
 
 
-@given(encounters())
-def test_two_ranges_leave_every_placement_as_it_was(encounter: Encounter) -> None:
-    assume(encounter.is_tame)
-    found = encounter.solutions()
-    pair_observations = sightings_of(encounter, encounter.p1b)[:2]
-    assert weigh_placements(found, pair_observations, 1000.0, FLOOR) == tuple(found)
-
-
-@given(encounters(), st.floats(0.5, 2.0), angles)
-def test_a_third_range_drops_the_placements_that_predict_another(
-    encounter: Encounter, way: float, course: float
-) -> None:
-    assume(encounter.is_tame)
-    third = step(Pose(encounter.p1b.x, encounter.p1b.y, course), way, 0.0, 1.0)
-    pair_observations = sightings_of(encounter, third)
-    wrong = [p for p in encounter.solutions() if nearest([p], encounter.truth) > 0.1]
-    told = [
-        p
-        for p in wrong
-        if abs(separation(p, encounter.p2a, third) - (pair_observations[2].range or 0.0)) > 0.1
-    ]
-    left = weigh_placements(told, pair_observations, 1000.0, FLOOR)
-    assert all(nearest([placement], encounter.truth) < 1e-3 for placement in left) or all(
-        encounter.residual(placement) < 2e-7 for placement in left
-    )
-    assert (
-        weigh_placements(
-            told, [*pair_observations[:2], PairObservation(2, encounter.p2a, third, 5e3)], 1e4, FLOOR
-        )
-        == ()
-    )
-
-
 @given(encounters(), st.floats(0.5, 2.0), angles)
 def test_no_detection_rules_out_the_placements_that_predict_one(
     encounter: Encounter, way: float, course: float
@@ -519,8 +424,3 @@ def test_no_detection_rules_out_the_placements_that_predict_one(
     left = weigh_placements(found, silent, true - 1e-3, FLOOR)
     assert nearest(left, encounter.truth) < EXACT
     assert left == tuple(p for p in found if separation(p, encounter.p2a, third) > true - 1e-3)
-
-
-@given(angles, angles)
-def test_angles_differ_by_the_shorter_way_round(one: float, other: float) -> None:
-    assert turned(one, other) == pytest.approx(turned(one + TAU, other - 2 * TAU), abs=EXACT)

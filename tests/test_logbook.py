@@ -17,7 +17,7 @@ from agent.planning.state import RobotState
 from agent.planning.tasks import Done
 from compose.scenario.scenario_file import load
 from protocol.messages import MAX_REPORT_RANGES, MAX_REPORT_RUNS, Localised, Ranged, Report, Undecided
-from protocol.motion import ORIGIN, Pose, Segment, step
+from protocol.motion import Pose, Segment
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
 
 Tick = tuple[float, float, float | None]
@@ -226,27 +226,6 @@ def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: st
 
 
 # --- the content of a log -----------------------------------------------------------------------------
-
-
-@given(ticks, st.data())
-def test_a_log_knows_where_the_robot_was_at_every_tick(driven: list[Tick], data: st.DataObject) -> None:
-    book = prefixes(driven)[-1]
-    track = [ORIGIN]
-    for v, omega, _ in driven:
-        track.append(step(track[-1], v, omega, 0.5))
-    first = data.draw(st.integers(0, len(driven)))
-    last = data.draw(st.integers(first, len(driven)))
-    found = book.track(ORIGIN, first, last, 0.5)
-    assert len(found) == last - first + 1
-    for pose, true in zip(
-        [*found, book.pose(ORIGIN, last, 0.5)], [*track[first : last + 1], track[last]], strict=True
-    ):
-        assert (pose.x, pose.y, pose.heading) == pytest.approx((true.x, true.y, true.heading), abs=1e-9)
-
-
-def test_equal_manoeuvres_are_one_entry() -> None:
-    book = MotionLog().drove(1.0, 0.0).drove(1.0, 0.0).drove(1.0, 0.5).drove(1.0, 0.0, 3)
-    assert book == MotionLog(6, (Segment(2, 1.0, 0.0), Segment(1, 1.0, 0.5), Segment(3, 1.0, 0.0)))
 
 
 # --- contradictions -----------------------------------------------------------------------------------

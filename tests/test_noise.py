@@ -7,7 +7,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from contextlib import closing
-from itertools import combinations, pairwise, product
+from itertools import pairwise, product
 from pathlib import Path
 
 import numpy as np
@@ -260,20 +260,6 @@ def test_ranges_are_gaussian_with_the_given_sigmas() -> None:
     assert are_uncorrelated(errors[0], errors[2])
 
 
-def test_a_sigma_is_of_its_own_sensor_only() -> None:
-    a, b, both = all_ranges(near("anchor_sigma = 0.05"), 50)
-    assert set(both) == {APART}
-    assert len({*a, *b}) == 100
-    a, b, both = all_ranges(near("mutual_sigma = 0.05"), 50)
-    assert (set(a), set(b)) == ({RHO_A}, {RHO_B})
-    assert len(set(both)) == 50
-
-
-def test_another_seed_is_another_noise() -> None:
-    one, other = (to_anchors(near("anchor_sigma = 0.05", seed=seed), 20)[0] for seed in (1, 2))
-    assert not set(one) & set(other)
-
-
 @pytest.mark.parametrize("share", series([0.05, 0.25]))
 def test_outliers_have_their_probability_and_a_uniform_positive_bias(share: float) -> None:
     least, most = 0.4, 1.6
@@ -287,16 +273,6 @@ def test_outliers_have_their_probability_and_a_uniform_positive_bias(share: floa
         quarters = np.histogram(biased, 4, (least, most))[0]
         assert all(has_share(int(quarter), len(biased), 0.25) for quarter in quarters)
         assert is_white(bias)
-
-
-@pytest.mark.long
-def test_biases_are_drawn_for_each_sensor_and_robot() -> None:
-    told = all_ranges(near("outliers = 0.25"))
-    biases = [known(ranges) - rho for ranges, rho in zip(told, (RHO_A, RHO_B, APART), strict=True)]
-    for one, other in combinations(biases, 2):
-        both = (one != 0.0) & (other != 0.0)
-        assert has_share(int(both.sum()), N, 0.0625)
-        assert are_uncorrelated(one[both], other[both])
 
 
 def test_outliers_and_sigmas_add_up() -> None:
@@ -319,18 +295,6 @@ def test_drop_outs_have_their_probability_each_sensor_on_its_own(share: float) -
         assert is_white(dropped)
     assert are_uncorrelated(gone[0], gone[1])
     assert are_uncorrelated(gone[0], gone[2])
-
-
-def test_a_range_that_is_dropped_leaves_the_contact() -> None:
-    scenario = near("drop_outs = 0.5")
-    world, dropped = release(scenario), 0
-    for tick in range(100):
-        for observation in observations(moved_to(world, tick)):
-            (contact,) = observation.contacts
-            assert contact.heard == (tick,)
-            assert contact.range in (None, APART)
-            dropped += contact.range is None
-    assert 50 < dropped < 150
 
 
 def test_reports_are_received_despite_a_drop_out(tmp_path: Path) -> None:
@@ -563,12 +527,6 @@ def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], l
             assert ended is None
         simulation.end(MissionEnd(ticks, "undecided"))
     return truths, told
-
-
-@by_noise
-def test_a_recording_gives_the_same_truth_again(noise: str, tmp_path: Path) -> None:
-    truths, _ = driven(near(noise), tmp_path, 60)
-    assert [moment.truth for moment in read(tmp_path).ticks] == truths
 
 
 @by_noise

@@ -46,8 +46,6 @@ from protocol.messages import (
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Covariance, Pose, Segment, step
 from protocol.noise import Noise
-from protocol.sweep_strips import SweptArea, surveyed_path
-from protocol.sweep_ticks import contact_ticks, sweep_speed
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
 from tests.commands import TandemProcess
 from tests.commands import journals as journals_of
@@ -409,17 +407,6 @@ def test_visitors_sweep_and_the_robots_that_they_have_visited_are_their_beacons(
         assert (robot in finders) == (one.visitor == robot and last[one.visited] is one)
 
 
-@given(st.floats(1.0, 100.0), st.floats(1.0, 100.0), st.integers(1, 5))
-def test_every_place_of_an_area_is_near_a_strip(width: float, height: float, parts: int) -> None:
-    area = SweptArea(0.0, 0.0, width, height, parts)
-    ways = [surveyed_path(area, part, R, (-9.0, 3.0), (-5.0, 3.0)) for part in range(parts)]
-    inside = [[(x, y) for x, y in way if x >= 0.0] for way in ways]
-    strips = sorted({one[area.across] for way in inside for one in way})
-    edges = [0.0, (height, width)[1 - area.across]]
-    gaps = [2.0 * (strips[0] - edges[0]), 2.0 * (edges[1] - strips[-1]), *np.diff(strips)]
-    assert max(gaps) <= 2.0 * 0.65 * R + 1e-9
-
-
 # --- a contact ----------------------------------------------------------------------------------------
 
 MISSION = Mission(
@@ -495,14 +482,6 @@ def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them() -
         if one is not None:
             frame = encode(Estimate(0, "u", (), one.poses, False, one.probabilities, one.covariance))
             assert decode(frame, Estimate).world == one.poses
-
-
-def test_the_same_ranges_do_not_count_twice_through_the_finder() -> None:
-    """However long a contact lasts, the error of the finder's pose is one unknown."""
-    for times in (2, 4, 8):
-        found = estimated(contact_with(0.2, 2, times)[0], MISSION)
-        assert found is not None
-        assert found.covariance.position_sigma >= 0.2
 
 
 @pytest.mark.long
@@ -596,12 +575,6 @@ def test_malformed_references_are_refused() -> None:
     tiny = Covariance(1e-300, 0.0, 0.0, 1e-300, 0.0, 1e-300)
     for wrong in ({"covariance": flat}, {"covariance": tiny}, {"tick": good.since + 1}):
         assert planner.malformed(replace(good, prior=replace(good.prior, **wrong))) is not None
-
-
-def test_a_contact_is_longer_where_ranges_are_less_accurate() -> None:
-    assert sweep_speed(MISSION) == 1.0
-    noise = replace(MISSION.noise, mutual_sigma=0.1)
-    assert contact_ticks(replace(MISSION, noise=noise)) >= 3.9 * contact_ticks(MISSION)
 
 
 # --- a robot that dies --------------------------------------------------------------------------------

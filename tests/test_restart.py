@@ -27,7 +27,7 @@ from compose.launch.processes import free_endpoint
 from compose.scenario.kills import parse
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
-from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal
+from protocol.journal.journal_file import CorruptJournal, Journal
 from protocol.journal.resume import Retrace
 from protocol.messages import (
     Cause,
@@ -571,15 +571,6 @@ def test_a_journal_that_another_process_has_is_refused(recording: Path) -> None:
             refuses(recording, *part, says=f"{recording / name}.journal is in use by another process")
 
 
-def test_a_journal_is_locked_as_long_as_it_is_open(tmp_path: Path) -> None:
-    path = tmp_path / "a.journal"
-    with Journal(path) as book:
-        book.write(b"one")
-        with pytest.raises(CannotRecord, match="in use by another process"):
-            Retrace(path)
-    Retrace(path).close()
-
-
 @pytest.mark.long
 def test_an_agent_refuses_a_world_that_has_lost_its_journal(recording: Path, paper_1: str) -> None:
     with TandemProcess("agent", "b", "--connect", paper_1):
@@ -588,13 +579,6 @@ def test_an_agent_refuses_a_world_that_has_lost_its_journal(recording: Path, pap
     assert ended.status == 3
     said = f"the world was restarted without its recording: the world is at tick 0, a at tick {tick}"
     assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before
-
-
-def test_a_run_is_a_new_one(recording: Path) -> None:
-    before = journals(recording)
-    ended = tandem("run", "paper-1", "--out", recording)
-    refused(ended, f"--out: {recording} already contains a recording; choose another folder")
-    assert journals(recording) == before
 
 
 def test_an_empty_journal_is_begun(tmp_path: Path) -> None:

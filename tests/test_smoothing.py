@@ -159,18 +159,6 @@ def test_what_is_seen_off_its_place_is_attributed_to_the_noise_before(
     assert errors.ravel() == near(expected)
 
 
-@few
-@given(manoeuvres, periods, drifts)
-def test_noise_has_the_size_of_what_was_measured_and_the_course_of_what_was_driven(
-    driven: list[tuple[float, float]], period: float, drift: VelocityNoise
-) -> None:
-    path, measured = track_of(driven, period), track_of([(1.0, -0.5)] * len(driven), period)
-    wandered = model_of(path, drift, measured)
-    assert wandered.variances is not None
-    assert wandered.variances.ravel() == pytest.approx(variances(drift, measured))
-    assert wandered.b == pytest.approx(model_of(path, drift).b)
-
-
 # --- the ranges ---------------------------------------------------------------------------------------
 
 

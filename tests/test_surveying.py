@@ -90,14 +90,6 @@ def test_a_robot_alone_stays_within_the_given_distance_of_its_anchor(
     assert math.hypot(there.x, there.y) <= within + 0.02
 
 
-@given(st.floats(0.2, 1.0), angles, angles)
-def test_alone_a_robot_stays_in_range_of_its_anchor(part: float, bearing: float, heading: float) -> None:
-    rho = part * REACH
-    pose = Pose(rho * math.cos(bearing), rho * math.sin(bearing), heading)
-    there = after(pose, plan_alone([held(pose)], MISSION))
-    assert math.hypot(there.x, there.y) <= REACH
-
-
 @given(st.floats(-1.5, 1.5), st.floats(0.4, 1.8))
 def test_of_mirror_images_a_robot_drives_where_their_ranges_differ(along: float, aside: float) -> None:
     """Ahead, behind and at rest, both mirror images predict the same ranges."""

@@ -9,12 +9,12 @@ from functools import partial
 from statistics import mean
 
 import pytest
-from hypothesis import example, given, settings
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from compose.scenario.group_plan import GroupPlan, PlannedVisit, group_plan, least_makespan, planned_meetings
 from compose.scenario.wake_up_search import short_forest
-from compose.scenario.wake_up_sectors import MOST_TRAVEL, lateral, sector_forest
+from compose.scenario.wake_up_sectors import MOST_TRAVEL, sector_forest
 from compose.scenario.wake_up_tree import MeetingTimes, WakeUpForest, optimal_forest
 from protocol.mission import Mission
 from protocol.noise import Noise
@@ -132,13 +132,6 @@ def test_a_small_plan_is_the_best_of_all_plans(anchors: Anchors, drawn: list[flo
     plan = group_plan(anchors, seed_time, 1.0, meeting)
     assert plan.bound == pytest.approx(least_bound(anchors, seed_time, meeting))
     assert least_makespan(plan.travel) == pytest.approx(least_bound(anchors, seed_time, 0.0))
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("seed", range(4))
-def test_a_plan_of_six_robots_is_the_best_of_all_plans(seed: int) -> None:
-    anchors = drawn_anchors(6, seed)
-    assert plan_of(anchors).bound == pytest.approx(least_bound(anchors, orbit_time(anchors), MEETING_S))
 
 
 @given(groups(3, 7), st.randoms(use_true_random=False))
@@ -269,29 +262,6 @@ def test_a_forest_of_sectors_ends_within_the_proved_factor_of_the_lower_bound(gr
     assert forest.last_end(group.times) <= FACTOR * group.times.earliest_end() * (1 + 1e-12)
 
 
-@given(drawn_groups)
-@example(Group(200, 0.0, 12, plans.fan))
-@example(Group(200, 1000.0, 1, plans.fan))
-@settings(max_examples=30, deadline=None)
-def test_each_cell_is_localised_within_the_proved_time_after_its_first_meeting(group: Group) -> None:
-    forest = sector_forest(group.times, group.anchors, group.meeting)
-    ends, root = forest.ends(group.times), {b: b for _, b in forest.seeds}
-    for place, robot in forest.hops:
-        root[robot] = root[place]
-    for _, b in forest.seeds:
-        cell = [robot for robot in root if root[robot] == b and robot != b]
-        radius = max([math.dist(group.anchors[b], group.anchors[robot]) for robot in cell], default=0.0)
-        most = MOST_TRAVEL * radius + group.meeting * math.log2(len(cell) + 1)
-        assert max(ends[robot] for robot in (b, *cell)) <= (ends[b] + most) * (1 + 1e-12)
-
-
-@given(st.floats(0.0, math.tau), st.floats(0.0, math.tau))
-def test_the_way_across_a_sector_is_as_the_proof_needs_it(angle: float, other: float) -> None:
-    chord = 2.0 * math.sin(min(angle, math.pi) / 2.0)
-    assert lateral(angle) >= chord + lateral(angle / 2.0) - 1e-12
-    assert lateral((angle + other) / 2.0) >= (lateral(angle) + lateral(other)) / 2.0 - 1e-12
-
-
 @given(
     st.floats(1 / 25, 2.0), st.floats(-3.0, 2.5), st.floats(0.3, 3.0), st.sampled_from([0.0, 0.02, 0.05, 0.2])
 )
@@ -328,11 +298,6 @@ def test_sectors_are_the_plan_where_the_search_finds_a_longer_one() -> None:
     times = MeetingTimes(seed, meeting_times(anchors, 100.0).hop)
     assert plan.bound == pytest.approx(sector_forest(times, anchors, 100.0).last_end(times))
     assert plan.bound < 0.95 * short_forest(times).last_end(times)
-
-
-def test_the_same_group_has_the_same_plan() -> None:
-    anchors = drawn_anchors(12, 0)
-    assert plan_of(anchors) == plan_of(anchors)
 
 
 def test_pairs_that_are_far_apart_meet_at_the_same_time() -> None:

@@ -10,8 +10,6 @@ import os
 import re
 import shutil
 import socket
-import subprocess
-import sys
 from pathlib import Path
 from signal import SIGINT, SIGKILL
 from urllib.error import HTTPError
@@ -360,13 +358,6 @@ def test_what_is_no_summary_of_an_estimate_is_one_line(tmp_path: Path) -> None:
     assert ended.err.count("\n") == 1
 
 
-def test_a_manifest_that_is_nested_too_deeply_is_one_sentence(tmp_path: Path) -> None:
-    (tmp_path / "sweep.json").write_text("[" * 1000)
-    ended = tandem("watch", str(tmp_path))
-    assert ended.status == USER_ERROR
-    assert ended.err.endswith("sweep.json is not a valid sweep manifest: it is nested more than 64 deep\n")
-
-
 @pytest.mark.long
 def test_a_sweep_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -> None:
     spec = tmp_path / "speeds.toml"
@@ -463,23 +454,6 @@ def test_run_watch_serves_until_ctrl_c_and_writes_the_usual_recording(
         assert "localised after 48 ticks" in run.out
         expect(page.locator("#status")).to_have_text("connection to the server lost")
     assert journals(tmp_path / "record") == journals(paper_1)
-
-
-@pytest.mark.long
-def test_every_test_that_opens_a_page_skips_where_there_is_no_browser(tmp_path: Path) -> None:
-    ran = subprocess.run(
-        [sys.executable, "-m", "pytest", "-n0", "-p", "no:cacheprovider", "-rs", "tests/test_watch.py"]
-        + ["-m", "long", "-k", "run_watch_serves or by_keyboard_alone"],
-        cwd=Path(__file__).parents[1],
-        env=os.environ | {"PATH": str(tmp_path), "TANDEM_BROWSER": "chromium"},
-        capture_output=True,
-        text=True,
-        timeout=BOUND_S,
-        check=False,
-    )
-    assert ran.returncode == 0, ran.stdout + ran.stderr
-    assert "2 skipped" in ran.stdout
-    assert "there is no chromium: apt-get install chromium" in ran.stdout
 
 
 # --- the command ------------------------------------------------------------------------------------

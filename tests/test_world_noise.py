@@ -19,7 +19,7 @@ from compose.errors import BadScenario, Unworkable
 from compose.launch import in_process
 from compose.recording.cramer_rao import position_bounds
 from compose.recording.run import of_frames
-from compose.scenario.scenario_file import load, parse
+from compose.scenario.scenario_file import parse
 from protocol.journal.journal_file import MemoryJournal
 from protocol.messages import Command
 from protocol.motion import REST, Controls, Pose
@@ -432,16 +432,6 @@ def test_an_effect_leaves_other_sensors_as_they_were(world: str) -> None:
             )
 
 
-def test_a_range_that_no_outlier_hits_is_as_without_outliers() -> None:
-    plain = known(to_anchors(near(""), 500)[0])
-    short = known(to_anchors(near("short_outliers = 0.1"), 500)[0])
-    hit = plain != short
-    assert 20 < hit.sum() < 90
-    assert (short < plain)[hit].all()
-    faded = to_anchors(near("detection_exponent = 2"), 500)[0]
-    assert all(one is None or one == rho for one, rho in zip(faded, plain, strict=True))
-
-
 # --- the recording --------------------------------------------------------------------------------------
 
 
@@ -473,21 +463,6 @@ def test_the_audit_and_the_replay_accept_each_effect_and_find_a_forged_range(wor
     frames = [forged if frame == step.frame else frame for frame in recorded[name]]
     found = audit_run(of_frames({**recorded, name: frames})).violations
     assert (step.observation.tick, "a", "observation") in [(one.tick, one.robot, one.rule) for one in found]
-
-
-def test_the_audit_recomputes_ranges_with_the_table_in_the_recording() -> None:
-    recorded = frames_of(near("anchor_bias = 0.1", max_ticks=10))
-    scenario = decode(recorded["world.journal"][1], Scenario, MAX_FRAME_BYTES)
-    other = encode(replace(scenario, world_noise=WorldNoise(anchor_bias=0.2)))
-    found = audit_run(
-        of_frames(
-            {
-                **recorded,
-                "world.journal": [recorded["world.journal"][0], other, *recorded["world.journal"][2:]],
-            }
-        )
-    )
-    assert {one.rule for one in found.violations} == {"observation"}
 
 
 def test_the_audit_finds_a_table_that_no_run_accepts() -> None:
@@ -582,18 +557,6 @@ def test_a_mistake_in_the_table_is_named(world: str, says: str) -> None:
     assert "\n" not in str(bad.value)
 
 
-def test_a_mistake_in_the_table_is_one_line_and_status_2(tmp_path: Path) -> None:
-    for world, says in (
-        ("anchor_bias = {c = 1}", "world.noise.anchor_bias"),
-        ("lobes = 0", "world.noise.lobes"),
-    ):
-        (tmp_path / "near.toml").write_text(text(world))
-        ended = tandem("run", "near.toml", cwd=tmp_path)
-        assert (ended.status, ended.out) == (2, "")
-        assert ended.err.startswith(f"tandem run: near.toml: {says}: ")
-        assert ended.err.count("\n") == 1
-
-
 def test_robots_that_are_told_exact_sensors_have_exact_ones() -> None:
     with pytest.raises(
         Unworkable, match=r"near: world\.noise: the robots are told that all sensors are exact"
@@ -606,7 +569,3 @@ def test_robots_that_are_told_exact_sensors_have_exact_ones() -> None:
     assert exact.sensors.exact
     assert not exact.mission.noise.exact
     assert to_anchors(exact, 1) == [[RHO_A], [RHO_B]]
-
-
-def test_shipped_scenarios_have_one_noise() -> None:
-    assert type(load("noisy")) is Scenario
