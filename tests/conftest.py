@@ -15,7 +15,7 @@ from playwright.sync_api import Browser
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from tests.browser import Open, launched, pages, watching
-from tests.commands import tandem
+from tests.commands import ENDLESS, tandem
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None, max_examples=60)
 settings.load_profile("tandem")
@@ -97,6 +97,14 @@ def opened(browser: Browser) -> Iterator[Open]:
     """Yield a function that opens pages; the test fails on page errors and requests to other hosts."""
     with pages(browser) as opens:
         yield opens
+
+
+@pytest.fixture
+def endless(tmp_path: Path) -> Path:
+    """Return the file of a scenario that does not end during a test."""
+    path = tmp_path / "endless.toml"
+    path.write_text(ENDLESS)
+    return path
 
 
 @pytest.fixture(scope="module")

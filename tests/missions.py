@@ -1,12 +1,14 @@
-"""Missions in which robot a has a given start, and its anchor is at the origin."""
+"""Missions in this process."""
 
 from __future__ import annotations
 
 import math
 
+from compose.launch import in_process
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import parse
+from protocol.journal.journal_file import MemoryJournal
 from world.scenario import Scenario
 from world.sensors import anchor_ranges
 from world.truth import Truth
@@ -20,7 +22,7 @@ def mission_of(
     speed: float = 1.0,
     turn_rate: float = math.pi,
 ) -> Run:
-    """Run such a mission in this process. The peer starts half a metre from its own anchor."""
+    """Run a mission in which a starts so, with its anchor at the origin, and b half a metre from its own."""
     text = f"""
         name = "mission"
         planner = {{name = "{planner_name}"}}
@@ -44,3 +46,10 @@ def mission_of(
 def own_ranges(truth: Truth, scenario: Scenario) -> list[float | None]:
     """Return the measured range of each robot to its own anchor in m; None if it has none."""
     return [ranges[0].range if ranges else None for ranges in anchor_ranges(truth, scenario)]
+
+
+def kept(scenario: Scenario) -> dict[str, list[bytes]]:
+    """Return the journals of a run in this process."""
+    books = {name: MemoryJournal() for name in in_process.journals(scenario)}
+    in_process.played(scenario, books)
+    return {name: book.frames for name, book in books.items()}

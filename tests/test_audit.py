@@ -57,6 +57,7 @@ from tests.commands import (
     several_pairs,
     tandem,
 )
+from tests.missions import kept
 from tests.series import series
 from tests.test_real_time import missed
 from world import world_journal as reader_of_world
@@ -98,13 +99,6 @@ A, B = agent_journal("a"), agent_journal("b")
 def noise(seed: int, planner_name: str, outliers: float = 0.05) -> Scenario:
     text = NOISE.replace("outliers = 0.05", f"outliers = {outliers}")
     return parse(text.replace("SEED", str(seed)).replace("VARIANT", planner_name), "noise")
-
-
-def kept(scenario: Scenario) -> dict[str, list[bytes]]:
-    """Return the journals of a run in this process."""
-    books = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    in_process.played(scenario, books)
-    return {name: book.frames for name, book in books.items()}
 
 
 def found(findings: Findings) -> list[Found]:

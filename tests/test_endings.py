@@ -25,7 +25,6 @@ from compose.launch.supervisor import Supervisor
 from protocol.network.diagnosis import MUTE
 from protocol.network.inbox import Arrival, Inbox, Interrupted
 from tests.commands import (
-    ENDLESS,
     LONG,
     LONG_JOURNAL_BYTES,
     LONG_TICKS,
@@ -78,14 +77,6 @@ LAST_MOMENTS: dict[str, Moment] = {
 }
 SIGNALS = dict(zip([*MOMENTS, *LAST_MOMENTS], cycle([SIGINT, SIGTERM]), strict=False))
 """The signal that is sent at each moment: both in turn."""
-
-
-@pytest.fixture
-def endless(tmp_path: Path) -> Path:
-    """Return the file of a scenario that does not end during a test."""
-    path = tmp_path / "endless.toml"
-    path.write_text(ENDLESS)
-    return path
 
 
 @pytest.fixture

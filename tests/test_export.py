@@ -13,12 +13,10 @@ import re
 import shutil
 import subprocess
 import sys
-import zlib
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from signal import Signals
-from types import SimpleNamespace
 from typing import Any
 
 import msgpack
@@ -35,11 +33,10 @@ from compose.cli import run
 from compose.cli.main import parse
 from compose.launch import in_process
 from compose.recording.recording_files import WORLD_JOURNAL, agent_journal
-from compose.recording.run import Run, read
+from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from compose.view.drawing import LEAST_OPACITY
 from compose.view.export.folder import export
-from protocol import wire
 from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation
 from protocol.motion import wrap
@@ -102,15 +99,6 @@ def on_disk(folder: Path) -> dict[str, bytes]:
 
 
 # --- run.mcap -------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("recording", ["paper_1", "faulty"])
-@pytest.mark.long
-def test_every_journaled_frame_is_there_and_the_journals_can_be_made_anew(
-    recording: str, request: pytest.FixtureRequest
-) -> None:
-    folder: Path = request.getfixturevalue(recording)
-    assert journals_of(folder / "run.mcap") == on_disk(folder)
 
 
 @pytest.mark.parametrize("recording", ["paper_1", "faulty"])
@@ -386,17 +374,6 @@ def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
 # --- recordings that are incomplete, or from several hosts --------------------------------------------
 
 
-def test_journals_gathered_from_several_hosts_export_as_one(paper_1: Path, tmp_path: Path) -> None:
-    gathered = tmp_path / "gathered"
-    gathered.mkdir()
-    for name in (WORLD_JOURNAL, A, B):  # each from a host of its own, without any other file
-        (gathered / name).write_bytes((paper_1 / name).read_bytes())
-    assert tandem("export", gathered).status == 0
-    assert {name: (gathered / name).read_bytes() for name in FILES} == {
-        name: (paper_1 / name).read_bytes() for name in FILES
-    }
-
-
 @pytest.mark.parametrize("name", [WORLD_JOURNAL, A])
 def test_a_torn_journal_is_exported_to_the_tear(name: str, faulty: Path, tmp_path: Path) -> None:
     torn = tmp_path / "torn"
@@ -533,42 +510,3 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
 
 
 # --- reading ------------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("hardware", [False, True])
-def test_an_export_decodes_each_frame_once(
-    faulty: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, hardware: bool
-) -> None:
-    """A Report or a Command is in two journals and is decoded once. Each journal has its own Environment."""
-    for path in faulty.glob("agent-*.journal" if hardware else "*.journal"):
-        shutil.copyfile(path, tmp_path / path.name)
-    decoded: list[bytes] = []
-
-    def checksum(payload: memoryview) -> int:
-        decoded.append(bytes(payload))
-        return zlib.crc32(payload)
-
-    monkeypatch.setattr(wire, "zlib", SimpleNamespace(crc32=checksum))
-    export(read(tmp_path), tmp_path / "out")
-    frames = sum([len(list(journal_file.read(path))) for path in tmp_path.glob("*.journal")])
-    again = {msgpack.unpackb(payload)[0] for payload, times in Counter(decoded).items() if times > 1}
-    assert len(decoded) <= frames
-    assert again <= {"environment", "final-report", "mission-end"}
-
-
-def test_a_run_with_an_export_reads_its_recording_once(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """The outcome and the export are of one Run."""
-    found: list[Run] = []
-
-    def counted(folder: Path, *_command: str) -> Run:
-        found.append(read(folder))
-        return found[-1]
-
-    monkeypatch.setattr(run, "stop_by_signal", lambda _: None)  # it would affect the process of the tests
-    monkeypatch.setattr(run, "read", counted)
-    monkeypatch.setattr(run, "read_noted", counted)
-    assert run.main(parse(["run", "paper-1", "-q", "--out", str(tmp_path)])) == 0
-    assert (tmp_path / "run.mcap").exists()
-    assert len(found) == 1

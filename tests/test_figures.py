@@ -8,7 +8,6 @@ import shutil
 from pathlib import Path
 from typing import Any
 
-import msgpack
 import numpy as np
 import pytest
 from matplotlib.axes import Axes
@@ -18,7 +17,7 @@ from matplotlib.path import Path as PlanePath
 
 from compose.figures import one_robot, over_time
 from compose.figures.one_robot import outline_of
-from compose.figures.sheet import Absent, Sheet
+from compose.figures.sheet import Absent
 from compose.figures.style import SCREEN, look, save
 from compose.launch.in_process import run_mission
 from compose.recording.run import read
@@ -27,11 +26,10 @@ from compose.view.outlines import arc
 from compose.view.recorded import scenes_of
 from compose.view.web.sources import Recorded
 from protocol.journal.journal_file import CorruptJournal
-from protocol.journal.journal_file import read as frames
-from protocol.messages import Estimate
 from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
 from tests.commands import BENT, PAPER_1, Ended, several_pairs, tandem
+from tests.test_album import cut
 from tests.test_album import pair as pair_of
 from world.scenario import Scenario
 
@@ -39,13 +37,7 @@ NOISE = "[mission.noise]\nanchor_sigma = 0.05\nmutual_sigma = 0.05\n"
 BRIEF = PAPER_1.replace('name = "paper"', 'name = "assured"').replace("seed = 1", "seed = 1\nmax_ticks = 4")
 
 
-@pytest.fixture(scope="session")
-def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the recording of the shipped scenario."""
-    return recorded(load("noisy"), tmp_path_factory.mktemp("noisy"))
-
-
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def drawn(noisy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the folder of its figures."""
     folder = copied(noisy, tmp_path_factory.mktemp("drawn"))
@@ -114,12 +106,6 @@ def line(axes: Axes, gid: str) -> tuple[list[Any], list[Any]]:
 
 def ids(svg: Path) -> set[str]:
     return set(re.findall(r'id="([^"]+)"', svg.read_text()))
-
-
-def cut(journal: Path, count: int) -> None:
-    """Cut the journal after its first `count` frames, and add a torn one."""
-    left = list(frames(journal))[:count]
-    journal.write_bytes(b"".join([msgpack.packb(frame) for frame in left]) + b"\xc4\x10torn")
 
 
 # --- content --------------------------------------------------------------------------------------------
@@ -354,21 +340,6 @@ def refused(ended: Ended, words: str) -> None:
     assert words in ended.err
 
 
-def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
-    file = tmp_path / "file"
-    file.write_text("")
-    empty = tmp_path / "empty"
-    empty.mkdir()
-    refused(draw(tmp_path / "nowhere"), "nowhere contains no recording: there is no world.journal")
-    refused(draw(empty), "empty contains no recording: there is no world.journal")
-    refused(draw(file), "file cannot be read: Not a directory")
-    (empty / "world.journal").write_bytes(b"\xc1 no journal")
-    refused(draw(empty), "world.journal: damaged at byte 0")
-    (empty / "world.journal").write_bytes(b"")
-    refused(draw(empty), "world.journal: it contains no scenario")
-    assert [path.name for path in empty.iterdir()] == ["world.journal"]
-
-
 @pytest.mark.long
 def test_where_nothing_can_be_written_is_refused(noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
@@ -398,26 +369,6 @@ def test_a_robot_without_a_journal_is_named_and_the_others_are_drawn(noisy: Path
 # --- the reader -----------------------------------------------------------------------------------------
 
 
-def test_a_robots_estimates_are_one_a_tick_as_it_journaled_them(noisy: Path) -> None:
-    held = read(noisy).estimates("b")
-    assert [one.tick for one in held] == list(range(len(read(noisy).ticks)))
-    assert {one.robot for one in held} == {"b"}
-    assert all(isinstance(one, Estimate) for one in held)
-    assert held[-1].localised
-
-
-def test_the_journal_of_another_robot_is_not_taken_for_its_own(noisy: Path, tmp_path: Path) -> None:
-    folder = copied(noisy, tmp_path)
-    shutil.copyfile(folder / "agent-b.journal", folder / "agent-a.journal")
-    with pytest.raises(CorruptJournal, match=r"agent-a\.journal is the journal of b"):
-        read(folder).estimates("a")
-    shutil.copyfile(folder / "world.journal", folder / "agent-a.journal")
-    with pytest.raises(CorruptJournal, match=r"agent-a\.journal: "):
-        read(folder).estimates("a")
-    with pytest.raises(FileNotFoundError):
-        read(folder).estimates("z")
-
-
 def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> None:
     folder, other = copied(noisy, tmp_path), tmp_path / "other"
     run_mission(load("paper-1"), other)
@@ -432,14 +383,3 @@ def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> No
     ended = tandem("export", folder)
     assert ended.status == 2
     assert "another run" in ended.err
-
-
-@pytest.mark.long
-def test_a_figure_of_thirty_rows_has_room_for_each() -> None:
-    names = [f"row {i}" for i in range(30)]
-    sheet = Sheet(SCREEN, False, ["many"], [[name] for name in names])
-    for name in names:
-        sheet.tall(name, 1.0).set_ylabel(name)
-    figure = sheet.finished()  # a warning, as of a layout that has no room, is an error
-    heights = [sheet.panels[name].get_position().height * figure.get_figheight() for name in names]
-    assert heights == pytest.approx([1.0] * 30, abs=0.05)

@@ -26,7 +26,6 @@ from protocol.network.endpoints import at, listening
 from protocol.network.inbox import Inbox
 from tests.commands import (
     BOUND_S,
-    ENDLESS,
     OVER,
     TandemProcess,
     journals,
@@ -45,14 +44,6 @@ CAP_SYS_ADMIN, CAP_SYS_RESOURCE = 21, 24
 PR_CAPBSET_DROP = 24
 """<sys/prctl.h>"""
 NAMES = ("world", "agent a", "agent b")
-
-
-@pytest.fixture
-def endless(tmp_path: Path) -> Path:
-    """Return the file of a scenario that does not end during a test."""
-    path = tmp_path / "endless.toml"
-    path.write_text(ENDLESS)
-    return path
 
 
 def children_of(process: int) -> list[str]:

@@ -35,7 +35,7 @@ from compose.sweep.group_columns import group_columns
 from protocol.messages import Localised, Report, Undecided
 from protocol.motion import Covariance, Pose
 from tests.groups import random_table, table_of
-from tests.test_audit import kept
+from tests.missions import kept
 from tests.test_group_noise import TURNED
 from tests.test_group_runs import audited
 from world.scenario import Scenario
@@ -302,21 +302,6 @@ def test_after_all_retries_robots_visit_each_other_in_both_roles(seed: int) -> N
     assert {*late} == {*permutations([robot.id for robot in scenario.robots], 2)}
 
 
-def test_a_robot_is_told_the_visits_that_it_makes() -> None:
-    scenario = scenario_with(3)
-    assert scenario.confirmation is not None
-    for robot in scenario.robots:
-        config = scenario.config(robot.id)
-        assert config.confirms
-        planned = [one.visited for one in scenario.confirmation.visits if one.visitor == robot.id]
-        assert [one.visited for one in config.confirmations] == planned
-
-
-def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
-    scenario = scenario_with(3, TURNED)
-    assert validate(file_table(scenario), "group.toml").seeded(None) == scenario
-
-
 @pytest.mark.long
 def test_an_audit_finds_a_visit_that_is_not_planned() -> None:
     journals = without_attacker()
@@ -393,11 +378,6 @@ def test_a_union_covers_each_claim_and_its_difference(found: list[Localised]) ->
         off = minus(one.pose, union.pose)
         left = matrix(union) - matrix(one) - np.outer(off, off)
         assert np.linalg.eigvalsh(left).min() >= -1e-6 * np.abs(matrix(union)).max()
-
-
-@given(claims())
-def test_the_union_of_the_same_claims_is_that_claim(one: Localised) -> None:
-    assert np.allclose(matrix(covariance_union([one, one, one])), matrix(one), atol=1e-9)
 
 
 @pytest.mark.parametrize(

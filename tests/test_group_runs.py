@@ -37,7 +37,7 @@ from protocol.journal.journal_file import CorruptJournal
 from protocol.wire import encode
 from tests.commands import OVER, SECTION_IV, TandemProcess, journals, processes_of, until
 from tests.commands import tandem as tandem_command
-from tests.test_audit import kept
+from tests.missions import kept
 from world.near_pairs import near_pairs
 from world.scenario import PlannedMeeting, Scenario
 

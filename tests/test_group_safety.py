@@ -20,8 +20,8 @@ from protocol.messages import Contact
 from protocol.mission import Mission
 from protocol.motion import Pose
 from tests.groups import localised, table_of
+from tests.missions import kept
 from tests.series import series
-from tests.test_audit import kept
 from world.scenario import Scenario
 
 MISSION = Mission(3.0, 1.0, 1.0, math.pi, safety_distance=0.5)

@@ -51,7 +51,7 @@ from tests.commands import TandemProcess
 from tests.commands import journals as journals_of
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised
-from tests.test_audit import kept
+from tests.missions import kept
 from tests.test_group_runs import audited
 from tests.test_unanchored import bound, four, last_claim, scenario_of, table_with
 from world.scenario import Scenario

@@ -20,8 +20,8 @@ from protocol.journal import journal_file
 from protocol.messages import Command, MissionEnd, Observation, Report
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, encode
 from tests.commands import journals, tandem
+from tests.missions import kept
 from tests.same_plans import scenario as random_plan
-from tests.test_audit import kept
 from world.scenario import Scenario
 
 HEAD = 5

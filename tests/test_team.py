@@ -45,9 +45,9 @@ from protocol.team_motion import spiral
 from protocol.wire import decode, encode
 from tests.commands import journals
 from tests.commands import tandem as tandem_command
+from tests.missions import kept
 from tests.moving_groups import PERIOD_S, moving_group
 from tests.series import series
-from tests.test_audit import kept
 from world.hardware.driver import Reading
 from world.hardware.measurements import InvalidReading, observation_frame
 from world.scenario import Scenario

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from playwright.sync_api import expect
 
-from agent.planning import unanchored
 from agent.planning.agenda import Agenda
 from agent.planning.state import RobotState
 from agent.planning.sweep import second_half, strips, without_strips
@@ -29,7 +28,6 @@ from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.reasons import reason_for
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames, read
-from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import load, parse, validate
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
@@ -47,7 +45,7 @@ from protocol.wire import decode, encode
 from tests.browser import Open, scrub_to, shot, watching
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised, table_of
-from tests.test_audit import kept
+from tests.missions import kept
 from tests.test_group_runs import audited, with_scenario
 from world.hardware.driver import Reading
 from world.hardware.measurements import observation_frame
@@ -188,16 +186,6 @@ def test_a_finder_and_the_robot_that_it_has_found_sweep_each_strip_once(
     assert len(taken) == 2 * (more // 2)
 
 
-@pytest.mark.long
-def test_robots_that_search_once_they_are_found_save_a_quarter_of_the_ticks(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    scenarios = [scenario_of(table_with(12, 10, seed)) for seed in range(4)]
-    together = sum([last_claim(run_mission(one)) for one in scenarios])
-    monkeypatch.setattr(unanchored, "_searches", lambda _: False)
-    assert together < 0.75 * sum([last_claim(run_mission(one)) for one in scenarios])
-
-
 def test_the_strips_of_a_robot_that_dies_there_are_swept_by_others() -> None:
     table = table_with(8, 6, 3)
     before = run_mission(scenario_of(table))
@@ -300,11 +288,6 @@ def test_the_last_robots_of_a_drawn_group_have_no_anchor() -> None:
     assert scenario.planned_sweep.sweep.x_max == pytest.approx(10.0 * math.sqrt(5))
 
 
-def test_a_changed_scenario_keeps_its_robots_without_an_anchor() -> None:
-    scenario = scenario_of(four())
-    assert scenario_of(file_table(scenario)) == scenario
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -384,12 +367,6 @@ def test_a_silent_robot_without_an_anchor_is_given_up_after_the_area_is_swept(no
         table["mission"] |= {"noise": noise, "accuracy": 0.3}
     scenario = scenario_of(table)
     assert 2.0 * bound(scenario) < given_up_after(scenario) < scenario.max_ticks
-
-
-def test_each_robot_knows_all_others_of_its_group() -> None:
-    scenario = scenario_of(four())
-    for robot in ("a", "b", "u", "v"):
-        assert {robot, *scenario.config(robot).others} == {"a", "b", "u", "v"}
 
 
 def test_a_robot_of_a_pair_needs_an_anchor() -> None:

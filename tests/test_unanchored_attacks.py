@@ -25,7 +25,7 @@ from compose.sweep.cells import cells, setting_of
 from protocol.messages import Contact, Localised, Observation, Report, ReportedPose, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step, wrap
 from protocol.rounding import TOLERANCE
-from tests.test_audit import kept
+from tests.missions import kept
 from tests.test_group_runs import audited
 from tests.test_unanchored import four, last_claim, scenario_of, table_with
 

@@ -20,13 +20,12 @@ from compose.launch import in_process
 from compose.recording.cramer_rao import position_bounds
 from compose.recording.run import of_frames
 from compose.scenario.scenario_file import parse
-from protocol.journal.journal_file import MemoryJournal
 from protocol.messages import Command
 from protocol.motion import REST, Controls, Pose
 from protocol.noise import Noise, VelocityNoise
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import journals, tandem
-from tests.missions import own_ranges
+from tests.missions import kept, own_ranges
 from tests.series import series
 from tests.test_noise import (
     APART,
@@ -435,20 +434,13 @@ def test_an_effect_leaves_other_sensors_as_they_were(world: str) -> None:
 # --- the recording --------------------------------------------------------------------------------------
 
 
-def frames_of(scenario: Scenario) -> dict[str, list[bytes]]:
-    """Return the journals of a mission in this process."""
-    books = {name: MemoryJournal() for name in in_process.journals(scenario)}
-    in_process.played(scenario, books)
-    return {name: book.frames for name, book in books.items()}
-
-
 def test_a_table_that_changes_nothing_leaves_the_same_bytes() -> None:
-    assert frames_of(near("", max_ticks=20)) == frames_of(near("mutual_sigma = 0.05", max_ticks=20))
+    assert kept(near("", max_ticks=20)) == kept(near("mutual_sigma = 0.05", max_ticks=20))
 
 
 @pytest.mark.parametrize("world", series(EFFECTS.values(), 1))
 def test_the_audit_and_the_replay_accept_each_effect_and_find_a_forged_range(world: str) -> None:
-    recorded = frames_of(near(world, max_ticks=25))
+    recorded = kept(near(world, max_ticks=25))
     run = of_frames(recorded)
     findings = audit_run(run)
     assert findings.violations == ()
@@ -466,7 +458,7 @@ def test_the_audit_and_the_replay_accept_each_effect_and_find_a_forged_range(wor
 
 
 def test_the_audit_finds_a_table_that_no_run_accepts() -> None:
-    recorded = frames_of(near("anchor_bias = 0.1", max_ticks=3))
+    recorded = kept(near("anchor_bias = 0.1", max_ticks=3))
     scenario = decode(recorded["world.journal"][1], Scenario, MAX_FRAME_BYTES)
     for noise, says in (
         (
