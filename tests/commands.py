@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import pty
+import re
 import struct
 import subprocess
 import sys
@@ -250,6 +251,15 @@ def on_a_terminal(*arguments: str | Path, columns: int = 80, cwd: Path | None = 
                 break
         os.close(ours)
         return command.ended().status, shown.decode(errors="replace")
+
+
+def refused(ended: Ended, *words: str) -> None:
+    """Assert that a command has reported a mistake of its user in one line that contains `words`."""
+    assert ended.status == 2, ended
+    assert ended.out == ""
+    assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
+    for word in words:
+        assert word in ended.err, ended.err
 
 
 @contextmanager

@@ -51,9 +51,9 @@ from tests.commands import (
     OVER,
     REAL_TIME,
     SECTION_IV,
-    Ended,
     TandemProcess,
     process_of,
+    refused,
     several_pairs,
     tandem,
 )
@@ -823,13 +823,6 @@ def test_the_command_prints_the_first_twenty_violations_and_the_number_of_others
     assert lines[15:17] == ["", "tick 0, a, decision: in its Estimate, localised is true, expected false"]
     assert len(lines[16:]) == 21
     assert lines[-1] == "and 28 more"
-
-
-def refused(ended: Ended, words: str) -> None:
-    assert ended.status == 2, ended
-    assert ended.out == ""
-    assert re.fullmatch(r"tandem \w+: [^\n]+\n", ended.err), ended.err
-    assert words in ended.err
 
 
 def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:

@@ -14,21 +14,13 @@ from compose.cli.removed import REMOVED
 from compose.errors import BadScenario, UserError
 from compose.scenario.scenario_file import parse
 from protocol.mission import Mission, infeasibility
-from tests.commands import PAPER_1, Ended, several_pairs, tandem, world
+from tests.commands import PAPER_1, refused, several_pairs, tandem, world
 
 LISTEN = ("--listen", "tcp/127.0.0.1:7447")
 CONNECT = ("--connect", "tcp/127.0.0.1:7447")
 GOOD = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 500")
 FOUR = several_pairs(2)
 SWEEP = 'name = "mine"\nscenario = "paper-1"\ntrials = 1\n'
-
-
-def refused(ended: Ended, *words: str) -> None:
-    assert ended.status == 2, ended
-    assert ended.out == ""
-    assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
-    for word in words:
-        assert word in ended.err, ended.err
 
 
 def refused_scenario(text: str | bytes, folder: Path, field: str) -> None:

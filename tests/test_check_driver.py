@@ -12,7 +12,7 @@ from compose.launch.driver_loader import config_of
 from compose.scenario.scenario_file import load, parse
 from compose.terminal.finding import WRONG
 from tests import broken_drivers, virtual_time
-from tests.commands import tandem
+from tests.commands import refused, tandem
 from tests.test_group_field import FAR
 
 MANOEUVRE_S = 0.1
@@ -105,16 +105,12 @@ def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:
     ],
 )
 def test_what_is_no_driver_is_one_line(name: str, said: str) -> None:
-    ended = tandem("check-driver", name)
-    assert ended.status == 2
-    assert ended.err.startswith("tandem check-driver: ")
-    assert said in ended.err
-    assert ended.err.count("\n") == 1
+    refused(tandem("check-driver", name), "tandem check-driver: ", said)
 
 
 def test_an_option_that_a_driver_does_not_know_is_one_line() -> None:
-    ended = tandem("check-driver", "docs.rover:Rover", "--option", "colour=red")
-    assert ended.status == 2
-    assert "docs.rover:Rover: cannot be created: TypeError: " in ended.err
-    assert "colour" in ended.err
-    assert ended.err.count("\n") == 1
+    refused(
+        tandem("check-driver", "docs.rover:Rover", "--option", "colour=red"),
+        "docs.rover:Rover: cannot be created: TypeError: ",
+        "colour",
+    )

@@ -27,8 +27,7 @@ from compose.sweep import spec
 from compose.sweep.cells import cells
 from compose.sweep.trial import Trial, run_trial
 from protocol.journal.journal_file import MemoryJournal
-from tests.commands import ENDLESS, PAPER_1, TandemProcess, tandem, temporary_in, until
-from tests.test_bad_input import refused
+from tests.commands import ENDLESS, PAPER_1, TandemProcess, refused, tandem, temporary_in, until
 from world.scenario import Scenario
 
 SMALL = """

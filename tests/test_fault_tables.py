@@ -9,8 +9,8 @@ import pytest
 
 from compose.errors import BadScenario
 from compose.scenario.scenario_file import parse
-from tests.commands import PAPER_1, SECTION_IV, journals, several_pairs, tandem
-from tests.test_bad_input import refused, refused_scenario
+from tests.commands import PAPER_1, SECTION_IV, journals, refused, several_pairs, tandem
+from tests.test_bad_input import refused_scenario, refused_text
 from world.faults import Fault, LinkSelector
 
 ROUGH = """
@@ -106,13 +106,6 @@ BAD_FIELDS: dict[str, Sequence[str]] = {
     "contact_ticks": ("5", "[5]", "[1, 2, 3]", "{}"),
     "link": ("1", '["a", "b"]', "true"),
 }
-
-
-def refused_text(text: str, says: str) -> None:
-    with pytest.raises(BadScenario) as bad:
-        parse(text, "mine.toml")
-    assert str(bad.value).startswith(f"mine.toml: {says}")
-    assert "\n" not in str(bad.value)
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ from protocol.journal import journal_file
 from protocol.messages import Command, OfRobot
 from protocol.motion import REST
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import OVER, PAPER_1, Ended, TandemProcess, process_of, processes_of, tandem
+from tests.commands import OVER, PAPER_1, Ended, TandemProcess, process_of, processes_of, refused, tandem
 
 STARTS = {"a": "2.4,-1.2,4.8", "b": "11.3,-0.4,3.6"}
 ASSURED = "max_ticks = 120\n" + PAPER_1.replace('"paper"', '"assured"').replace('"paper-1"', '"field"')
@@ -258,8 +258,4 @@ def test_a_mistake_is_one_line(tmp_path: Path, arguments: tuple[str, ...], said:
     with journal_file.Journal(tmp_path / "agent-a.journal") as old:
         old.write(encode(load("paper-1").config("a")))
     words = [word.format(faults=tmp_path / "faults.toml", recording=tmp_path) for word in arguments]
-    ended = tandem("robot", *words, "--driver", "docs.rover:Rover")
-    assert ended.status == 2
-    assert said in ended.err
-    assert ended.err.startswith("tandem robot: ")
-    assert ended.err.count("\n") == 1
+    refused(tandem("robot", *words, "--driver", "docs.rover:Rover"), said, "tandem robot: ")

@@ -28,7 +28,7 @@ from compose.view.web.sources import Recorded
 from protocol.journal.journal_file import CorruptJournal
 from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
-from tests.commands import BENT, PAPER_1, Ended, several_pairs, tandem
+from tests.commands import BENT, PAPER_1, Ended, refused, several_pairs, tandem
 from tests.test_album import cut
 from tests.test_album import pair as pair_of
 from world.scenario import Scenario
@@ -333,13 +333,6 @@ def test_each_robot_of_several_pairs_has_a_picture_of_its_own_pair(tmp_path: Pat
 # --- bad input ------------------------------------------------------------------------------------------
 
 
-def refused(ended: Ended, words: str) -> None:
-    assert ended.status == 2, ended
-    assert ended.out == ""
-    assert re.fullmatch(r"tandem figures: [^\n]+\n", ended.err), ended.err
-    assert words in ended.err
-
-
 @pytest.mark.long
 def test_where_nothing_can_be_written_is_refused(noisy: Path, tmp_path: Path) -> None:
     folder = copied(noisy, tmp_path)
@@ -380,6 +373,4 @@ def test_a_journal_of_another_run_is_not_used(noisy: Path, tmp_path: Path) -> No
     assert [note.split("/")[-1] for note in journals.notes] == [
         "agent-a.journal: belongs to another run: its configuration does not match the world's"
     ]
-    ended = tandem("export", folder)
-    assert ended.status == 2
-    assert "another run" in ended.err
+    refused(tandem("export", folder), "another run")

@@ -73,6 +73,4 @@ def test_the_parser_of_a_command_imports_no_module_of_commands(command: CommandE
 
 
 def test_a_missing_argument_is_named_without_hidden_ones() -> None:
-    ended = tandem("run")
-    assert ended.status == 2
-    assert ended.err == "tandem run: the following arguments are required: SCENARIO\n"
+    assert tandem("run") == (2, "", "tandem run: the following arguments are required: SCENARIO\n")

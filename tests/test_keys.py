@@ -24,22 +24,13 @@ from protocol.network import keys as tree
 from protocol.network import session
 from protocol.network.diagnosis import MUTE
 from protocol.network.endpoints import BadConfiguration, Endpoints, configured, listening
-from tests.commands import Ended, TandemProcess, journals, tandem
+from tests.commands import TandemProcess, journals, refused, tandem
 
 EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")
 
 
 def contents(folder: Path) -> dict[str, bytes]:
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
-
-
-def mistaken(ended: Ended, *words: str) -> None:
-    """Assert that the process reports a user's mistake in one line that contains these words."""
-    assert ended.status == 2, ended
-    assert ended.out == ""
-    assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
-    for word in words:
-        assert word in ended.err
 
 
 # --- the files ------------------------------------------------------------------------------------------
@@ -123,7 +114,7 @@ def test_a_folder_that_is_removed_is_made_anew_by_the_same_authority(tmp_path: P
 def test_invalid_input_of_the_keys_command_is_one_line(
     arguments: tuple[str, ...], words: str, tmp_path: Path
 ) -> None:
-    mistaken(tandem("keys", tmp_path / "keys", *arguments), words)
+    refused(tandem("keys", tmp_path / "keys", *arguments), words)
     assert not (tmp_path / "keys").exists()
 
 
@@ -163,7 +154,7 @@ def test_a_folder_that_is_damaged_is_left_as_it_is(
     shutil.copytree(keys, tmp_path / "keys")
     damage(tmp_path / "keys")
     before = contents(tmp_path / "keys")
-    mistaken(tandem("keys", tmp_path / "keys", "--robots", "a"), words)
+    refused(tandem("keys", tmp_path / "keys", "--robots", "a"), words)
     after = contents(tmp_path / "keys")
     assert {name: after[name] for name in before if not name.endswith(KEYED)} == {
         name: before[name] for name in before if not name.endswith(KEYED)
@@ -183,7 +174,7 @@ def test_a_mission_with_tls_has_the_recording_of_one_without(tmp_path: Path) -> 
 
 
 def test_a_mission_in_one_process_has_nothing_to_secure() -> None:
-    mistaken(tandem("run", "paper-1", "--in-process", "--secure"), "--secure: --in-process has no network")
+    refused(tandem("run", "paper-1", "--in-process", "--secure"), "--secure: --in-process has no network")
 
 
 def test_a_folder_of_keys_may_lie_anywhere(keys: Path, mine: Path, tmp_path: Path) -> None:
@@ -395,7 +386,7 @@ def test_a_command_refuses_a_wrong_configuration(part: tuple[str, ...], tmp_path
     file = tmp_path / "mine.json5"
     file.write_text("{mode: 'peer'}")
     ended = tandem(*part, "--connect", free_endpoint(), "--config", file)
-    mistaken(ended, f"--config: {file}: mode: 'peer', but a process that only connects is a client here")
+    refused(ended, f"--config: {file}: mode: 'peer', but a process that only connects is a client here")
 
 
 def test_a_configuration_may_name_the_endpoint(tmp_path: Path) -> None:
@@ -447,7 +438,7 @@ def test_a_configuration_may_name_the_endpoint(tmp_path: Path) -> None:
 def test_flags_that_exclude_each_other_are_refused(
     arguments: tuple[str, ...], words: str, keys: Path
 ) -> None:
-    mistaken(tandem(*(one.format(keys=keys) for one in arguments)), words)
+    refused(tandem(*(one.format(keys=keys) for one in arguments)), words)
 
 
 # --- warnings -------------------------------------------------------------------------------------------
@@ -490,4 +481,4 @@ def test_loopback_is_what_no_other_machine_reaches(endpoint: str, exposed: bool)
 def test_an_unreadable_folder_is_reported() -> None:
     folder = "k" * 300
     ended = tandem("agent", "a", "--connect", "tls/127.0.0.1:7447", "--keys", folder)
-    mistaken(ended, f"--keys: {folder}: cannot be read: File name too long")
+    refused(ended, f"--keys: {folder}: cannot be read: File name too long")

@@ -17,7 +17,7 @@ from compose.view.web.sources import Recorded
 from protocol.journal import journal_file
 from protocol.messages import Command, DeadlineMissed
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
-from tests.commands import journals, tandem
+from tests.commands import journals, refused, tandem
 
 SCHEDULE = ("b@20:command", "a@30", "world@30:journal", "b@47:journal", "a@48")
 
@@ -213,9 +213,7 @@ def test_thousands_of_kills_are_shown_in_time(paper_1: Path) -> None:
 
 def test_a_run_does_not_add_to_the_kills_of_another(tmp_path: Path) -> None:
     (tmp_path / KILLS).touch()
-    ended = tandem("run", "paper-1", "-q", "--out", tmp_path)
-    assert ended.status == 2
-    assert "already contains a recording" in ended.err
+    refused(tandem("run", "paper-1", "-q", "--out", tmp_path), "already contains a recording")
 
 
 def test_a_torn_last_line_is_ignored(disturbed: Path, tmp_path: Path) -> None:

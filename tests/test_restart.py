@@ -49,10 +49,10 @@ from tests.commands import (
     OVER,
     PAPER_1,
     REAL_TIME,
-    Ended,
     TandemProcess,
     journals,
     processes_of,
+    refused,
     tandem,
     world,
 )
@@ -223,13 +223,6 @@ def test_a_mistake_about_kills_is_one_line(arguments: list[str], says: str, tmp_
     ended = tandem("run", "paper-1", "--out", "out", *arguments, cwd=tmp_path)
     refused(ended, says)
     assert list(tmp_path.iterdir()) == []
-
-
-def refused(ended: Ended, *words: str) -> None:
-    assert ended[:2] == (2, ""), ended
-    assert re.fullmatch(r"tandem[^\n]*: [^\n]+\n", ended.err), ended.err
-    for word in words:
-        assert word in ended.err
 
 
 # --- incomplete recordings ----------------------------------------------------------------------------

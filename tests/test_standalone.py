@@ -14,7 +14,7 @@ from compose.scenario.scenario_file import load
 from compose.view.web import costs
 from compose.view.web.standalone import standalone_page
 from tests.browser import BOUND_MS, Open, chromium_only, picture, shot, until_shown
-from tests.commands import tandem
+from tests.commands import refused, tandem
 from world.scenario import Scenario
 
 MOST_BYTES = 2_000_000
@@ -25,8 +25,7 @@ MOST_BYTES = 2_000_000
 def file(paper_1: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the file of paper-1, written by the command."""
     out = tmp_path_factory.mktemp("one") / "file"
-    ended = tandem("export", paper_1, "--html", "--out", out)
-    assert (ended.status, ended.out, ended.err) == (0, f"{out / 'run.html'}\n", "")
+    assert tandem("export", paper_1, "--html", "--out", out) == (0, f"{out / 'run.html'}\n", "")
     return out / "run.html"
 
 
@@ -118,11 +117,9 @@ def test_no_text_of_a_run_ends_its_script(tmp_path: Path) -> None:
 
 def test_what_is_no_recording_is_one_line(tmp_path: Path) -> None:
     (tmp_path / "empty").mkdir()
-    ended = tandem("export", "empty", "--html", cwd=tmp_path)
-    assert ended.status == 2
-    assert ended.err == (
-        "tandem export: empty contains no recording, no sweep, no estimate, and no folders with recordings\n"
+    assert tandem("export", "empty", "--html", cwd=tmp_path) == (
+        2,
+        "",
+        "tandem export: empty contains no recording, no sweep, no estimate, and no folders with recordings\n",
     )
-    ended = tandem("export", "empty", "--html", "--pyfg", cwd=tmp_path)
-    assert ended.status == 2
-    assert "not allowed with argument" in ended.err
+    refused(tandem("export", "empty", "--html", "--pyfg", cwd=tmp_path), "not allowed with argument")

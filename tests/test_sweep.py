@@ -38,7 +38,7 @@ from compose.sweep.table import schema_of
 from compose.sweep.worker import PLAY
 from protocol.network.inbox import Inbox
 from protocol.noise import Noise, VelocityNoise
-from tests.commands import PAPER_1, Ended, TandemProcess, on_a_terminal, tandem, temporary_in, until
+from tests.commands import PAPER_1, Ended, TandemProcess, on_a_terminal, refused, tandem, temporary_in, until
 from tests.series import series
 from world.world_noise import WorldNoise
 
@@ -953,10 +953,9 @@ def test_a_mistake_in_a_spec_is_one_line_and_status_2(folder: Path) -> None:
 
 
 def test_a_spec_that_is_not_there_is_named() -> None:
-    ended = tandem("sweep", "nowhere")
-    assert ended.status == 2
-    assert ended.err.startswith(
-        "tandem sweep: nowhere: neither a file nor a shipped sweep (anchors, any-start, "
+    refused(
+        tandem("sweep", "nowhere"),
+        "tandem sweep: nowhere: neither a file nor a shipped sweep (anchors, any-start, ",
     )
 
 
