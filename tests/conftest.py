@@ -13,9 +13,12 @@ from hypothesis import settings
 from playwright.sync_api import Browser
 
 from compose.launch import in_process
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_recording import RangeRecording
 from compose.scenario.scenario_file import load
 from tests.browser import Open, launched, pages, watching
 from tests.commands import ENDLESS, tandem
+from tests.range_tables import SAMPLE
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None, max_examples=60)
 settings.load_profile("tandem")
@@ -117,6 +120,12 @@ def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the recording of noisy, which tests must not change."""
     return recorded("noisy", tmp_path_factory.mktemp("recorded"))
+
+
+@pytest.fixture(scope="module")
+def sample() -> RangeRecording:
+    """Return the two robots of the recorded sample."""
+    return read_ranges(SAMPLE)
 
 
 def recorded(name: str, folder: Path) -> Path:

@@ -11,10 +11,10 @@ from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from tests.browser import BOUND_MS, Open, chromium_only, picture, scrub_to, until_shown, watching
 from tests.commands import tandem
+from tests.range_tables import SAMPLE
 from tests.series import series
 
 axe = pytest.importorskip("axe_playwright_python.sync_playwright", reason="axe-core is not installed")
-SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 NARROW = 390
 """The width of a telephone in pixels."""
 

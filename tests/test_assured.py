@@ -426,8 +426,6 @@ coordinates = st.floats(-20.0, 20.0)
 poses = st.builds(Pose, coordinates, coordinates, angles)
 
 
-# --- anywhere in the plane ----------------------------------------------------------------------------
-
 # --- special starts -----------------------------------------------------------------------------------
 
 

@@ -26,20 +26,15 @@ from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.radio_errors import PairErrors, range_calibration, true_errors
 from compose.recording.estimating.recorded_measurements import measurements
-from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import Numbers, RangeRecording, TruePath
 from protocol.noise import Noise
 from tests.commands import tandem
+from tests.range_tables import SAMPLE
 from tests.test_cases_estimates import CASES
-from tests.test_estimate import NEES_99_9, SAMPLE, with_ranges
+from tests.test_estimate import NEES_99_9, with_ranges
 
 BIAS, MORE, SCALE, OUTLIERS = 0.35, 0.15, 0.05, 0.05
 """The errors that are added to the sample: a bias (m), a further one of A and B, a scale, and outliers."""
-
-
-@pytest.fixture(scope="module")
-def sample() -> RangeRecording:
-    return read_ranges(SAMPLE)
 
 
 @pytest.fixture(scope="module")

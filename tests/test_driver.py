@@ -588,25 +588,11 @@ def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_th
     assert began == pytest.approx(3.0)
 
 
-def test_a_robot_with_a_slow_driver_receives_the_commands_of_its_agent(stage: Stage) -> None:
+def test_a_robot_with_a_slow_driver_receives_the_commands_of_its_agent(stage: Stage, played: Play) -> None:
     class Slow(Recorded):
         def sense(self, tick: int) -> Reading:
             stage.now += 2.0 * MANOEUVRE_S
             return super().sense(tick)
 
-    driver = Slow()
-    driver.clock = stage.monotonic
-    field = Field(driver, CONFIG, "r", stage, max_ticks=100, manoeuvre_s=MANOEUVRE_S, timeout=1.0)
-
-    def answer(key: str, frame: bytes) -> None:
-        if key == keys.observation("r", "a"):
-            message = decode(frame, Observation | MissionEnd | FinalReport)
-            if isinstance(message, Observation):
-                command = Command(message.tick, "a", 1.0, 0.0, 1, "straight")
-                stage.comes("command", keys.command("r", "a"), encode(command), 0.001)
-
-    stage.answer = answer
-    stage.alive("a", "b")
-    field.attach(LINK)
-    end = field.run_mission(10.0, lambda: None)
+    _, end, _ = played(Slow(), lambda tick: [encode(command(tick))], ticks=100, timeout=1.0)
     assert (end.outcome, end.tick) == ("undecided", 100)

@@ -507,6 +507,3 @@ def test_ctrl_c_ends_an_export_and_leaves_nothing_half_written(paper_1: Path, tm
         with pytest.raises(AssertionError, match="stopped"):
             export(read(paper_1), tmp_path / "out", check=functools.partial(stopped_unless, some))
         assert {path.name for path in (tmp_path / "out").iterdir()} == left
-
-
-# --- reading ------------------------------------------------------------------------------------------

@@ -26,7 +26,7 @@ from compose.recording.ranging.range_mcap import rows_as_they_arrive
 from compose.recording.ranging.range_recording import RangeRecording
 from protocol.motion import Pose, compose
 from tests.commands import tandem
-from tests.test_estimate import SAMPLE
+from tests.range_tables import SAMPLE
 from tests.test_house import HOUSE
 
 PROFILE = "uwb-calibrated"

@@ -7,7 +7,6 @@ errors that the ranges have in common. A range that may be an outlier has the we
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -20,6 +19,7 @@ from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.ranging.range_files import read_ranges
 from protocol.motion import Pose, step
+from tests.range_tables import SAMPLE
 
 pytest.importorskip("gtsam", reason="gtsam has no wheel for this platform or this Python")
 import gtsam
@@ -29,7 +29,6 @@ from tests.pair_starts import kinds, m2
 
 pytestmark = pytest.mark.long
 
-SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 WINDOWS = 5
 LENGTH_S, APART_S = 20.0, 2.0
 """The length of a window, and the time in s from the beginning of one to that of the next."""

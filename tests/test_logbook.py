@@ -225,9 +225,6 @@ def test_the_longest_report_that_there_is_fits_its_frame(begin: int, verdict: st
     assert size <= MAX_REPORT_BYTES
 
 
-# --- the content of a log -----------------------------------------------------------------------------
-
-
 # --- contradictions -----------------------------------------------------------------------------------
 
 SOUND = Report(

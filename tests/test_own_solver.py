@@ -21,9 +21,9 @@ from tests.expected.playing import decisions
 from tests.groups import table_of
 from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
 from tests.own_solvers import Broken, Exiting, Smoother, WithBroken, WithNoSolver, WithNothing, WithSmoother
+from tests.range_tables import SAMPLE
 
 SHIPPED = Path(scenario.__file__).parent / "shipped" / "noisy.toml"
-SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 EXAMPLES = Path(__file__).parents[1] / "docs" / "examples"
 
 

@@ -31,6 +31,7 @@ from tandem import scenarios
 from tandem.columns import Table
 from tests.benchmark import in_process as benchmark
 from tests.commands import tandem as command
+from tests.range_tables import SAMPLE
 from tests.series import series
 
 MODULES = (
@@ -44,7 +45,6 @@ MODULES = (
     ".worlds",
     ".estimates",
 )
-SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 TABLES = ("truth", "observations", "commands", "estimates", "messages", "claims")
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,8 +31,7 @@ from compose.recording.ranging.range_steps import (
 )
 from protocol.motion import ORIGIN, Pose, step
 from protocol.motion import compose as composed
-
-SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
+from tests.range_tables import SAMPLE
 
 
 def odometry_of(

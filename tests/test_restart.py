@@ -6,7 +6,6 @@ import csv
 import os
 import re
 import shutil
-from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
 from queue import Empty, SimpleQueue
@@ -27,7 +26,7 @@ from compose.launch.processes import free_endpoint
 from compose.scenario.kills import parse
 from compose.scenario.scenario_file import load
 from protocol.journal import journal_file
-from protocol.journal.journal_file import CorruptJournal, Journal
+from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import Retrace
 from protocol.messages import (
     Cause,
@@ -58,7 +57,7 @@ from tests.commands import (
 )
 from tests.series import series
 from world.scenario import Scenario
-from world.simulation import Simulation, resumed
+from world.simulation import resumed
 from world.world_journal import world_history
 
 PARTS = ("agent-a", "agent-b", "world")
@@ -464,18 +463,6 @@ def recording(undisturbed: Path, tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.fixture
-def paper_1() -> Iterator[str]:
-    with world("paper-1") as (_, endpoint):
-        yield endpoint
-
-
-@pytest.fixture
-def paper_2() -> Iterator[str]:
-    with world("paper-2") as (_, endpoint):
-        yield endpoint
-
-
 def refuses(out: Path, *arguments: str, says: str) -> None:
     before = journals(out)
     refused(tandem(*arguments, "--out", out), "--out: ", says, "choose another folder")
@@ -534,11 +521,12 @@ def test_an_agents_journal_of_another_configuration_is_refused(recording: Path, 
 
 
 @pytest.mark.long
-def test_an_agents_journal_with_another_observation_is_refused(recording: Path, paper_2: str) -> None:
+def test_an_agents_journal_with_another_observation_is_refused(recording: Path) -> None:
     path = recording / "agent-a.journal"
     path.write_bytes(journal_file.packed(list(journal_file.read(path))[:4]))
-    with TandemProcess("agent", "b", "--connect", paper_2):  # its RobotConfigs are those of paper-1
-        ended = tandem("agent", "a", "--connect", paper_2, "--out", recording)
+    with world("paper-2") as (_, endpoint), TandemProcess("agent", "b", "--connect", endpoint):
+        # its RobotConfigs are those of paper-1
+        ended = tandem("agent", "a", "--connect", endpoint, "--out", recording)
     said = "the recording belongs to another run: its Observation of a at tick 0 differs"
     assert (ended.status, ended.err) == (3, f"tandem agent a: {said}\n")
 
@@ -565,25 +553,13 @@ def test_a_journal_that_another_process_has_is_refused(recording: Path) -> None:
 
 
 @pytest.mark.long
-def test_an_agent_refuses_a_world_that_has_lost_its_journal(recording: Path, paper_1: str) -> None:
-    with TandemProcess("agent", "b", "--connect", paper_1):
-        ended = tandem("agent", "a", "--connect", paper_1, "--out", recording)
+def test_an_agent_refuses_a_world_that_has_lost_its_journal(recording: Path) -> None:
+    with world("paper-1") as (_, endpoint), TandemProcess("agent", "b", "--connect", endpoint):
+        ended = tandem("agent", "a", "--connect", endpoint, "--out", recording)
     tick = agent_history(journal_file.read(recording / "agent-a.journal"), "a").steps[-1].observation.tick
     assert ended.status == 3
     said = f"the world was restarted without its recording: the world is at tick 0, a at tick {tick}"
     assert ended.err.splitlines()[-1] == f"tandem agent a: {said}"  # it may have told of a torn write before
-
-
-def test_an_empty_journal_is_begun(tmp_path: Path) -> None:
-    (tmp_path / "world.journal").touch()
-    old = Retrace(tmp_path / "world.journal")
-    simulation = resumed(load("paper-1"), old)
-    book, cut = old.open_for_append()
-    with book:
-        assert (simulation.tick, cut) == (0, 0)
-    with Journal(tmp_path / "new") as new:
-        Simulation(load("paper-1"), new)
-    assert (tmp_path / "world.journal").read_bytes() == (tmp_path / "new").read_bytes()
 
 
 @pytest.mark.long

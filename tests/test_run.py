@@ -23,13 +23,13 @@ from tests.commands import (
     several_pairs,
     tandem,
 )
+from tests.range_tables import SAMPLE
 from tests.series import series
 
 PAPER_TICKS = {"paper-1": 48, "paper-2": 110}
 COLUMNS = ["tick", "robot", "x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
 FLOATS = ["x", "y", "heading", "v", "omega", "anchor_range", "mutual_range"]
 EXACT_WHEELS = dict.fromkeys(("v", "omega", "v_floor", "omega_floor"), 0.0)
-SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 RECORD = ["agent-a.journal", "agent-b.journal", "summary.json", "ticks.csv", "world.journal"]
 
 

@@ -28,7 +28,6 @@ from agent.estimation.gaussian.odometry_noise import (
     Ticks,
     Track,
     attributed,
-    constant_effects,
     spread,
     track,
     wander,
@@ -137,15 +136,6 @@ def test_noise_of_the_odometry_spreads_along_the_path(look: Looks, drift: Veloci
     left, right = spread(model_of(look.path, drift), look.rows)
     both, ticks = left.mT @ right, look.rows.ticks.tick
     assert np.where(ticks[:, None] >= ticks, both, both.mT) == near(covariance)
-
-
-@some
-@given(looks(), drifts, seeds)
-def test_errors_of_the_odometry_move_every_later_place(look: Looks, drift: VelocityNoise, seed: int) -> None:
-    errors = np.random.default_rng(seed).normal(size=(2, len(look.path.v)))
-    measured = track(look.path.v - errors[0], look.path.omega - errors[1], look.path.period)
-    move = constant_effects(model_of(look.path, drift, measured), look.rows)[-1]
-    assert move == near(look.by_noise @ errors.ravel())
 
 
 @some
@@ -377,21 +367,6 @@ def test_no_step_of_a_fit_climbs(seed: int, noise: Noise, by: float) -> None:
     assert all(later <= earlier + 1e-5 for earlier, later in pairwise(costs)), costs
 
 
-@few
-@given(seeds)
-def test_a_fit_begins_on_the_path_that_it_is_given(seed: int) -> None:
-    one = told(seed, DRIFTING)
-    assume(clear(one))
-    first = pair_fit(one.guess, one.pair, Convergence(30))
-    assume(first.last_step < LAST_STEP)
-    (there,) = fits(one.pair, [first.start], Convergence(0))
-    assert there.last_step < 0.3, (
-        "the last step has been taken; among 938 draws, the next one had at most 0.073"
-    )
-    assert there.poses.tolist() == first.poses.tolist()
-    assert cost(one, there) < cost(one, pair_fit(first.guess, one.pair, Convergence(0)))
-
-
 ROUGH = Noise(
     0.01, 0.01, outliers=0.05, outlier_bias=(0.3, 2.0), odometry=VelocityNoise(0.001, 0.001)
 ).as_told
@@ -598,22 +573,6 @@ def test_the_distance_score_is_the_derivative_of_the_likelihood_by_the_distance_
     less, more = (likelihood(one, step) for step in (-small, small))
     tolerance = 1e-2 * math.sqrt(information)
     assert score == pytest.approx((more - less) / (2.0 * small), abs=tolerance, rel=1e-2)
-
-
-@few
-@given(seeds, noises)
-def test_the_information_of_the_distance_score_is_the_curvature_of_the_likelihood(
-    seed: int, noise: Noise
-) -> None:
-    """Ranges without errors: residuals would add to the curvature."""
-    one = told(seed, noise)
-    assume(clear(one))
-    one = one.ranging(distances(one.pair, one.guess))
-    found = settled(one)
-    _, information = distance_score(found, one.pair)
-    small = 0.02 / math.sqrt(information)
-    less, here, more = (likelihood(one, step) for step in (-small, 0.0, small))
-    assert information == pytest.approx((2.0 * here - more - less) / small**2, rel=0.05)
 
 
 def distance_score(found: Fit, pair: JointMeasurements) -> tuple[float, float]:

@@ -51,8 +51,8 @@ from tests.commands import (
     until,
     world,
 )
+from tests.range_tables import SAMPLE
 
-UWB_SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 FAST_TICKS = 1000
 """The number of ticks of about a second at full speed."""
 WITH_TIMEOUT = ("--timeout", "600")
@@ -332,7 +332,7 @@ def test_the_recordings_in_a_folder_are_listed(opened: Open, paper_1: Path, tmp_
 @pytest.mark.long
 def test_an_estimate_shows_its_robots_and_its_figures(opened: Open, tmp_path: Path) -> None:
     folder = tmp_path / "estimated"
-    assert tandem("estimate", str(UWB_SAMPLE), "--window", "0..12", "--out", str(folder)).status in (0, 1)
+    assert tandem("estimate", str(SAMPLE), "--window", "0..12", "--out", str(folder)).status in (0, 1)
     with watching(folder) as (_, where):
         page = opened(where)
         expect(page.locator("#title")).to_have_text("tiers-a-b-30-s.pyfg")

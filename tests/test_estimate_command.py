@@ -1,0 +1,177 @@
+"""The command `estimate`: its table, its files, the run that the page plays, and its refusals."""
+
+from __future__ import annotations
+
+import csv
+import json
+import math
+from pathlib import Path
+
+import pytest
+
+from compose.cli import estimate as estimate_command
+from compose.cli.commands import COMMANDS
+from compose.cli.main import command_parser
+from compose.errors import NOT_LOCALISED, USER_ERROR, CannotWrite, UserError
+from compose.recording.estimating import estimate_run
+from compose.recording.estimating.estimate_rows import PoseEstimateRow
+from compose.recording.estimating.estimate_run import RecordingEstimate
+from compose.recording.estimating.recorded_measurements import EPOCH_S, measurements
+from compose.recording.ranging.range_files import read_ranges
+from compose.recording.ranging.range_recording import (
+    RangeRecording,
+)
+from compose.view.epochs import write_player
+from compose.view.played_estimate import PLAYER_JSON, read_player
+from compose.view.recorded import scenes as recorded_scenes
+from protocol.motion import travelled
+from tests.commands import tandem
+from tests.range_tables import SAMPLE
+from tests.test_estimate import sample_estimates
+
+
+@pytest.fixture(scope="module")
+def of_sample(sample: RangeRecording) -> RecordingEstimate:
+    return sample_estimates(sample)
+
+
+def test_a_folder_that_cannot_be_written_is_refused_before_the_estimate(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "file").touch()
+    monkeypatch.setattr(estimate_run, "estimated", None)
+    parser = command_parser(next(one for one in COMMANDS if one.name == "estimate"))
+    words = [str(SAMPLE), "--window", "0..8", "--out", str(tmp_path / "file")]
+    with pytest.raises(CannotWrite, match="file cannot be written: File exists"):
+        estimate_command.main(parser.parse_all(words))
+
+
+def test_the_page_plays_an_estimate_as_a_run_in_which_claims_and_hypotheses_are_those_of_the_estimate(
+    sample: RangeRecording, of_sample: RecordingEstimate, tmp_path: Path
+) -> None:
+    problem = measurements(sample, ("A", "B"), "uwb-calibrated", None)
+    write_player(tmp_path, problem, of_sample)
+    found = read_player(tmp_path)
+    assert found is not None
+    known = found.run_data()
+    scenes = {one.tick: one for one in recorded_scenes(found.setup, known)}
+    for epoch in of_sample.epochs:
+        scene = scenes[round((epoch.t - problem.t0) / EPOCH_S)]
+        for row in epoch.rows:
+            player = scene.player(row.robot)
+            assert player.held is not None
+            assert player.command is not None
+            assert player.pose is not None
+            assert len(player.held.world) == len(epoch.hypotheses)
+            assert (player.held.world[0].x, player.held.world[0].y) == (row.x, row.y)
+            assert travelled(player.held.world[0], player.pose) == pytest.approx(row.position_error_m)
+            assert (player.command.verdict is not None) == row.claim
+    texts = [caption.text for scene in scenes.values() for caption in scene.captions]
+    assert "Both claim to know their poses." in texts
+    assert texts[-1] == "Both are localised: each knows its position and its heading."
+    ranged = sum([len(player.anchors) for scene in scenes.values() for player in scene.players])
+    assert ranged == of_sample.summary.ranges["A-LC0"] + of_sample.summary.ranges["B-LC1"]
+    text, file = (tmp_path / PLAYER_JSON).read_text(), tmp_path / PLAYER_JSON
+    for was, new, says in [
+        ('"mode":"estimate"', '"mode":null', "setup: it is not of an estimate"),
+        ('{"id":"B"', '{"id":"A"', "setup.robots: there are none, or two of one name"),
+        ('"tick":1,', '"tick":9,', "epochs: their ticks do not increase to that of the end"),
+        ('["observation",1,"A"', '["observation",1,"z"', "epochs: something is of another robot or tick"),
+    ]:
+        assert was in text
+        file.write_text(text.replace(was, new, 1))
+        with pytest.raises(UserError) as bad:
+            read_player(tmp_path)
+        assert str(bad.value) == f"{file} cannot be read: {says}"
+
+
+def test_the_command_writes_a_table_a_summary_and_figures(tmp_path: Path) -> None:
+    ended = tandem("estimate", str(SAMPLE), "--noise", "uwb-calibrated", "--out", "found", cwd=tmp_path)
+    assert (ended.status, ended.err) == (0, "")
+    page = (Path(__file__).parents[1] / "docs" / "howto-estimate.md").read_text("utf-8")
+    assert page.split("```text\n")[1].split("```")[0] in ended.out, "the page shows this table"
+    names = {"estimate.csv", "estimate.json", "estimate-path.svg", "estimate-over-time.svg"}
+    assert names <= {path.name for path in (tmp_path / "found").iterdir()}
+    with (tmp_path / "found" / "estimate.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert tuple(rows[0]) == PoseEstimateRow.__struct_fields__
+    assert {row["robot"] for row in rows} == {"A", "B"}
+    summary = json.loads((tmp_path / "found" / "estimate.json").read_text())
+    claim = summary["robots"]["A"]["first_claim"]
+    assert set(claim) == {
+        "t_s", "pose", "covariance", "probability", "position_error_m", "heading_error_rad", "nees",
+    }  # fmt: skip
+    assert [len(claim["covariance"]), len(claim["covariance"][0]), len(claim["pose"])] == [3, 3, 3]
+    assert summary["hypotheses"][0]["probability"] > 0.99
+    assert set(summary["calibration"]["pair_bias_m"]) == {"A-LC0", "B-LC1", "A-B"}
+    first = next(row for row in rows if row["robot"] == "A" and row["claim"] == "true")
+    assert [float(first[name]) for name in ("t_s", "x", "y", "heading")] == [claim["t_s"], *claim["pose"]]
+
+
+def test_without_truth_there_are_no_errors(tmp_path: Path) -> None:
+    lines = [line for line in SAMPLE.read_text().splitlines() if not line.startswith("VERTEX_SE2")]
+    first = [line for line in SAMPLE.read_text().splitlines() if line.startswith(("VERTEX_SE2 0.3107", "V"))]
+    begin = [line for line in first if line.split()[2] in ("A100", "B100")]
+    (tmp_path / "blind.pyfg").write_text("\n".join([*begin, *lines, ""]))
+    ended = tandem(
+        "estimate", "blind.pyfg", "--noise", "uwb-calibrated", "--window", "0..12", "--out", ".", cwd=tmp_path
+    )
+    assert ended.status == NOT_LOCALISED
+    assert "no claim at the end: " in ended.out
+    with (tmp_path / "estimate.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert {row["nees"] for row in rows} == {""}
+
+
+def test_anchors_with_a_sigma_are_estimated_and_written_as_the_next_estimate_reads_them(
+    sample: RangeRecording, tmp_path: Path
+) -> None:
+    lines = [f"{one.id},{one.x + 0.1},{one.y - 0.1},0.1" for one in sample.anchors]
+    (tmp_path / "anchors.csv").write_text("\n".join(["anchor,x,y,sigma", *lines, ""]))
+    ended = tandem(
+        "estimate", str(SAMPLE), "--noise", "uwb-calibrated", "--anchors", "anchors.csv", "--accuracy", "0.5",
+        "--window", "0..16", "--out", "found", cwd=tmp_path,
+    )  # fmt: skip
+    assert ended.err == ""
+    summary = json.loads((tmp_path / "found" / "estimate.json").read_text())
+    assert set(summary["anchors"]) == {"LC0", "LC1"}
+    (again, _) = read_ranges(SAMPLE, tmp_path / "found" / "anchors.csv").anchors
+    one = summary["anchors"]["LC0"]
+    assert [again.x, again.y] == one["position"]
+    assert 0.02 < again.sigma < 0.15
+    assert f"anchor LC0: {again.x:.2f} {again.y:.2f}, with a sigma of {again.sigma:.2f} m" in ended.out
+    for true in sample.anchors:
+        position = summary["anchors"][true.id]["position"]
+        assert math.dist(position, (true.x, true.y)) < 0.4
+
+
+@pytest.mark.parametrize(
+    ("words", "says"),
+    [
+        (("bad.pyfg",), "bad.pyfg, line 2: EDGE_RANGE has 3 fields and needs 5"),
+        (("no.pyfg",), "no.pyfg cannot be read: No such file or directory"),
+        ((str(SAMPLE), "--robots", "A,C"), "has no robot C; it has A, B"),
+        ((str(SAMPLE), "--robots", "A"), "one robot needs ranges to two anchors at different places: A has"),
+        ((str(SAMPLE), "--noise", "ubw"), "'ubw' is neither a profile (uwb, uwb-calibrated, wheels)"),
+        (
+            (str(SAMPLE), "--noise", "bad.toml"),
+            "bad.toml: mission.noise: unknown field 'range_bais'; did you mean 'range_bias'?",
+        ),
+        ((str(SAMPLE), "--window", "40..50"), "has odometry of 30.0"),
+        ((str(SAMPLE), "--window", "10"), "'10' is not a window in seconds such as 10..40"),
+        ((str(SAMPLE), "--anchors", "bad.csv"), "bad.csv, line 2: y: expected a number, got 'x'"),
+        ((str(SAMPLE), "--anchors", "half.csv"), "half.csv, line 2: it has one of x and y"),
+        ((str(SAMPLE), "--anchors", "none.csv"), "two robots need ranges to two anchors"),
+    ],
+)
+def test_bad_input_is_one_line_with_its_place(words: tuple[str, ...], says: str, tmp_path: Path) -> None:
+    (tmp_path / "bad.pyfg").write_text("VERTEX_XY L0 4.0 5.0\nEDGE_RANGE 0.6 A1 B1\n")
+    (tmp_path / "bad.toml").write_text("[mission.noise]\nrange_bais = 0.1\n")
+    (tmp_path / "bad.csv").write_text("anchor,x,y\nLC0,1,x\n")
+    (tmp_path / "half.csv").write_text("anchor,x\nLC0,1\n")
+    (tmp_path / "none.csv").write_text("anchor\nLC0\n")
+    ended = tandem("estimate", *words, cwd=tmp_path)
+    assert ended.status == USER_ERROR
+    assert ended.out == ""
+    assert ended.err.count("\n") == 1
+    assert says in ended.err
