@@ -13,6 +13,7 @@ from agent.planning.registry import PLANNER_CLASSES
 from agent.planning.state import RobotState
 from compose.scenario.scenario_file import load
 from protocol.messages import Command, Observation, Report
+from world.scenario import Scenario
 from world.tick import World, advance, observations, release
 
 NAMES = [
@@ -39,12 +40,12 @@ def planner_of(state: RobotState) -> Planner[RobotState, Report]:
     return PLANNER_CLASSES[state.config.planner_name]()
 
 
-def steps(name: str, *, at_rest: int = 0) -> Iterator[Step]:
-    """Yield the ticks of the scenario `name`, and check that it ends localised.
+def steps(scenario: str | Scenario, *, at_rest: int = 0) -> Iterator[Step]:
+    """Yield the ticks of a scenario or of the one of this name, and check that it ends localised.
 
     In the first `at_rest` ticks, all robots miss the deadline.
     """
-    world = release(load(name))
+    world = release(load(scenario) if isinstance(scenario, str) else scenario)
     play = PLANNER_CLASSES[world.scenario.planner_name]()
     states = {robot.id: play.start(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:

@@ -143,14 +143,6 @@ def test_a_report_comes_within_the_delays_of_the_faults_that_were_there_when_it_
         assert least <= now - tick <= most
 
 
-@settings(max_examples=60)
-@given(plans, meetings, seeds)
-def test_a_fault_plan_and_a_seed_determine_all_deliveries(
-    plan: list[Fault], contact: list[bool], seed: int
-) -> None:
-    assert flown(plan, contact, seed) == flown(plan, contact, seed)
-
-
 def test_agents_store_reports_for_the_longest_delay_of_the_fault_plan() -> None:
     most = [Fault(delay=(MAX_DELAY, MAX_DELAY), reorder=1.0), *[Fault(reorder=1.0)] * (MAX_FAULTS - 1)]
     lags = {now - tick for now, tick, _ in came(flown(most, [True] * 200))}
@@ -336,13 +328,6 @@ def test_more_or_less_loss_shifts_no_other_draw(loss: float) -> None:
     assert sum(map(Counter.total, more.values())) < sum(map(Counter.total, less.values())) or loss == 0.3
     for tick, copies in more.items():
         assert copies <= less[tick]
-
-
-def test_another_fault_shifts_no_draw_of_those_before_it() -> None:
-    contact = [True] * 2000
-    without, with_it = arrivals(flown(ROUGH, contact)), arrivals(flown([*ROUGH, Fault(loss=0.5)], contact))
-    assert 0 < len(with_it) < len(without)
-    assert all(copies <= without[tick] for tick, copies in with_it.items())
 
 
 def test_what_is_not_in_contact_shifts_no_draw() -> None:

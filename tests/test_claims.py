@@ -104,15 +104,6 @@ def test_nees_wraps_the_error_in_heading() -> None:
     assert nees(Pose(1.0, 2.0, 0.5 + 4 * math.tau), Pose(1.0, 2.0, 0.5), SURE) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_nees_of_errors_that_are_as_claimed_has_a_chi_square_of_three_degrees() -> None:
-    draw, p = np.random.default_rng(2), np.array(SURE.matrix)
-    errors = draw.multivariate_normal(np.zeros(3), p, 4000)
-    values = np.array([nees(Pose(*e), Pose(0.0, 0.0, 0.0), SURE) for e in errors.tolist()])
-    assert abs(values.mean() - 3.0) < 4.5 * math.sqrt(6.0 / len(values))
-    for share in (0.1, 0.5, 0.9, 0.99):
-        assert (values <= chi2.ppf(share, 3)).mean() == pytest.approx(share, abs=0.03)
-
-
 def test_nees_of_a_singular_covariance_counts_no_sigma_below_a_micrometre() -> None:
     here = Pose(0.0, 0.0, 0.0)
     nothing = Covariance(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)

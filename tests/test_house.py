@@ -237,7 +237,9 @@ def frozen(value: object) -> bytes:
     return repr(value).encode()
 
 
-@pytest.mark.parametrize("name", ["paper-1", "paper-2", "random"])
+@pytest.mark.parametrize(
+    "name", ["paper-1", "paper-2", "random", pytest.param("noisy", marks=pytest.mark.long)]
+)
 def test_the_same_values_give_the_same_step_and_are_left_as_they_were(name: str) -> None:
     for world, sensed, before, observed, reports, commands in steps(name):
         for observation in sensed:

@@ -23,7 +23,7 @@ from compose.security import certificates
 from protocol.network import keys as tree
 from protocol.network import session
 from protocol.network.diagnosis import MUTE
-from protocol.network.endpoints import BadConfiguration, Endpoints, configured, listening
+from protocol.network.endpoints import BadConfiguration, configured, listening
 from tests.commands import TandemProcess, journals, refused, tandem
 
 EVERYBODY = ("agent-a", "agent-b", "router", "viewer", "world")
@@ -171,10 +171,6 @@ def test_a_mission_with_tls_has_the_recording_of_one_without(tmp_path: Path) -> 
     assert journals(tmp_path / "secured") == journals(tmp_path / "open")
     ticks = [(tmp_path / name / "ticks.csv").read_bytes() for name in ("open", "secured")]
     assert ticks[0] == ticks[1]
-
-
-def test_a_mission_in_one_process_has_nothing_to_secure() -> None:
-    refused(tandem("run", "paper-1", "--in-process", "--secure"), "--secure: --in-process has no network")
 
 
 def test_a_folder_of_keys_may_lie_anywhere(keys: Path, mine: Path, tmp_path: Path) -> None:
@@ -433,6 +429,8 @@ def test_a_configuration_may_name_the_endpoint(tmp_path: Path) -> None:
         ),
         (("watch", "--keys", "{keys}/viewer", "--config", "x"), "not allowed with argument"),
         (("watch", ".", "--keys", "{keys}/viewer"), "--keys: a recording needs no network"),
+        (("run", "paper-1", "--in-process", "--secure"), "--secure: --in-process has no network"),
+        (("watch", "--keys", "k" * 300), f"--keys: {'k' * 300}: cannot be read: File name too long"),
     ],
 )
 def test_flags_that_exclude_each_other_are_refused(
@@ -458,27 +456,3 @@ def test_listening_beyond_this_machine_without_keys_is_warned_about(keys: Path) 
     with TandemProcess("world", "paper-1", "--listen", where, "--keys", keys / "world") as world:
         world.until_prints("waiting for")
         assert world.err == ""
-
-
-@pytest.mark.parametrize(
-    ("endpoint", "exposed"),
-    [
-        ("tcp/127.0.0.1:1", False),
-        ("tcp/127.9.9.9:1", False),
-        ("tcp/localhost:1", False),
-        ("tcp/[::1]:1", False),
-        ("tcp/[::]:1", True),
-        ("tcp/0.0.0.0:1", True),
-        ("tcp/10.0.0.1:1", True),
-        ("tcp/robot:1", True),
-        ("tls/10.0.0.1:1", True),
-    ],
-)
-def test_loopback_is_what_no_other_machine_reaches(endpoint: str, exposed: bool) -> None:
-    assert (endpoint in Endpoints(listen=(endpoint,)).exposed) is exposed
-
-
-def test_an_unreadable_folder_is_reported() -> None:
-    folder = "k" * 300
-    ended = tandem("agent", "a", "--connect", "tls/127.0.0.1:7447", "--keys", folder)
-    refused(ended, f"--keys: {folder}: cannot be read: File name too long")

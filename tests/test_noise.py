@@ -530,13 +530,6 @@ def driven(scenario: Scenario, folder: Path, ticks: int) -> tuple[list[Truth], l
 
 
 @by_noise
-@pytest.mark.parametrize("seed", series([2, 10, 11]))
-def test_the_recording_of_a_mission_is_read_as_it_ran(noise: str, seed: int, tmp_path: Path) -> None:
-    played = in_process.run_mission(load(str(noisy(noise, tmp_path)), seed=seed), tmp_path)
-    assert read(tmp_path).world == played.world
-
-
-@by_noise
 def test_ticks_gives_what_was_driven_and_measured(noise: str, tmp_path: Path) -> None:
     """It contains the true v and omega, and the ranges with noise that the robots received."""
     scenario = near(noise)

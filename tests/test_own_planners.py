@@ -10,49 +10,41 @@ from collections.abc import Callable
 from functools import partial
 from itertools import takewhile
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import msgspec
 import pytest
 import tomli_w
-from msgspec.structs import asdict, replace
+from msgspec.structs import replace
 
 import tandem
 from agent.process.report_bodies import malformed, report_of
 from agent.process.report_buffer import ReportBuffer
-from agent.process.robot import REPORTS_KEPT, Robot
 from compose.audit.planner_checks import QuietInbox, check_planner
 from compose.audit.rules import audit_run
 from compose.errors import BadScenario, PlannerFailed, UserError
-from compose.launch import class_loader, in_process, processes
+from compose.launch import class_loader
 from compose.launch.in_process import run_mission
 from compose.launch.planner_guard import GuardedPlanner
 from compose.launch.planner_loader import planner_of
 from compose.launch.processes import free_endpoint
-from compose.recording import run as recorded
 from compose.recording.run import read
-from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import ScenarioTemplate, load, setting, validate
 from compose.terminal.finding import WRONG
 from protocol.messages import (
     MAX_BODY_BYTES,
-    Cause,
-    Contact,
     Inconsistent,
     Localised,
-    MissionEnd,
     Observation,
     Report,
     Undecided,
 )
-from protocol.motion import ORIGIN, REST, Covariance, Pose
+from protocol.motion import ORIGIN, Covariance, Pose
 from protocol.network import keys
 from protocol.network.inbox import Arrival
 from protocol.wire import MAX_REPORT_BYTES, encode
 from tandem.planning import Assured, Paper, RobotState
-from tests import own_planners
-from tests.commands import PAPER_1, TandemProcess
+from tests.commands import PAPER_1, TandemProcess, journals
 from tests.commands import tandem as command
 from tests.groups import group_of, table_of
 from tests.own_planners import Counting, Parcel, Wrapping
@@ -72,10 +64,6 @@ def own(name: str, scenario: str = "paper-1", **options: Any) -> ScenarioTemplat
 def first_state() -> RobotState:
     """Return the state of a robot that has been observed once."""
     return Assured().observe(Assured().start(load("paper-1").config("a")), Observation(0, "a", None, 1.0))
-
-
-def journals(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for path in sorted(folder.glob("*.journal"))}
 
 
 @pytest.fixture(scope="module")
@@ -305,24 +293,6 @@ def test_check_planner_finds_each_mistake_for_its_own_reason(name: str) -> None:
     assert why in wrong.text
 
 
-def test_check_planner_says_why_processes_did_not_complete_the_mission(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    end = MissionEnd(17, "failed", (Cause("failed", text="no answer from b at tick 17 for 30 s"),))
-
-    def without_answer(scenario: Scenario, folder: Path, *_: Any, **__: Any) -> list[Kill]:
-        for name in in_process.journals(scenario):
-            (folder / name).touch()
-        return []
-
-    monkeypatch.setattr(processes, "run_mission", without_answer)
-    monkeypatch.setattr(recorded, "read", lambda _: SimpleNamespace(end=end))
-    checks = check_planner(own("Sound").scenario, QuietInbox("test"))
-    wrong = next(one for one in checks if one.mark == WRONG)
-    rule, why = "it decides the same as processes over the network", "no answer from b at tick 17 for 30 s"
-    assert wrong.text == f"{rule}: the mission failed: {why}"
-
-
 @pytest.mark.parametrize("name", series([OWN, "assured", "paper"]))
 def test_check_planner_passes_a_sound_planner(name: str) -> None:
     ended = command("check-planner", name, "--mission", "paper-1", "--fault", FAULTS)
@@ -458,16 +428,6 @@ def test_the_agent_counts_and_drops_a_report_that_the_decoder_refuses() -> None:
     assert buffer.of("b", 1) is None
 
 
-def test_a_robot_keeps_its_contacts_only_while_reports_of_their_tick_are_stored() -> None:
-    config = load("paper-1").config("a")
-    robot = Robot(config, planner_of(config))
-    for tick in range(200):
-        executed = REST if tick else None
-        robot.observation(Observation(tick, "a", executed, None, (Contact("b", None, ()),)))
-        robot.decide()
-    assert list(robot.contacts) == list(range(200 - REPORTS_KEPT - 2, 200))
-
-
 def test_a_decoder_that_fails_refuses_the_report() -> None:
     class Strict(Wrapping):
         def malformed(self, body: Parcel) -> str | None:
@@ -496,45 +456,9 @@ def test_the_largest_body_fits_a_frame_with_any_verdict(verdict: Any) -> None:
     assert len(encode(report)) <= MAX_REPORT_BYTES
 
 
-def test_a_planner_without_reports_of_its_own_sends_an_empty_body() -> None:
-    report = report_of(None, 3, "a")
-    assert report == Report(3, "a", body=b"\xc0")
-
-
-def test_shipped_planners_send_the_same_reports_as_before() -> None:
-    run = tandem.run("paper-1", planner="assured")
-    kinds = {
-        type(framed.report)
-        for agent in run.model.agents.values()
-        for s in agent.steps
-        for framed in s.received
-    }
-    assert kinds == {Report}
-
-
-def test_every_mistake_of_this_module_has_a_test() -> None:
-    classes = {name for name, value in vars(own_planners).items() if isinstance(value, type)}
-    mistakes = {name for name in classes if getattr(own_planners, name).__module__ == own_planners.__name__}
-    assert mistakes - {*BROKEN} == {
-        "Counting",
-        "Parcel",
-        "Wrapping",
-        "Sound",
-        "Incomplete",
-        "Local",
-        "Rendezvousless",
-        "Suited",
-    }
-
-
 def test_orbits_that_are_none_are_one_line() -> None:
     with pytest.raises(PlannerFailed, match=r"rendezvous\(\) returns NoneType, expected Rendezvous"):
         own("Rendezvousless")
-
-
-def test_a_config_without_options_is_that_of_a_shipped_planner() -> None:
-    config = own("Wrapping").scenario.config("a")
-    assert asdict(config).keys() == asdict(load("paper-1").config("a")).keys()
 
 
 def test_a_class_of_an_interactive_session_runs_in_one_process_only() -> None:

@@ -9,15 +9,13 @@ import sys
 from importlib import import_module
 from pathlib import Path
 from statistics import median
-from typing import Any, NoReturn
+from typing import Any
 
-import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
 import tandem
-from agent.process import agent_journal
 from compose import extras
 from compose.audit.rules import audit_run
 from compose.recording import run as recorded
@@ -27,7 +25,6 @@ from compose.recording.run import read
 from compose.recording.summary_json import summary
 from protocol.messages import Command
 from protocol.motion import REST
-from tandem import scenarios
 from tandem.columns import Table
 from tests.benchmark import in_process as benchmark
 from tests.commands import tandem as command
@@ -386,20 +383,6 @@ def test_a_run_equals_what_is_read_from_its_journals(changed: dict[str, Any]) ->
     assert (run.world, run.agents, run.journals) == (read.world, read.agents, read.journals)
     assert [*run.agents] == [*read.agents]
     assert [*run.journals] == [*read.journals]
-
-
-def test_a_run_with_another_seed_does_nothing_twice(monkeypatch: pytest.MonkeyPatch) -> None:
-    scenario = tandem.Scenario.load("random").with_({"mission.period": 1.0})
-
-    def again(*_: object) -> NoReturn:
-        raise AssertionError("this takes as long as the mission")
-
-    monkeypatch.setattr(msgspec.inspect, "type_info", again)
-    scenario = scenario.with_({"mission.accuracy": 0.2})
-    monkeypatch.setattr(scenarios, "validate", again)
-    monkeypatch.setattr(recorded, "_world", again)
-    monkeypatch.setattr(agent_journal, "decode", again)
-    assert tandem.run(scenario, seed=7).outcome == "localised"
 
 
 @pytest.mark.long

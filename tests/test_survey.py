@@ -2,25 +2,19 @@
 
 from __future__ import annotations
 
-import copy
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from functools import partial
 from itertools import pairwise
 
-import numpy as np
 import pytest
 from msgspec.structs import replace
 
 import tandem
-from agent.estimation.fit import fits
-from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.odometry_noise import track
-from agent.estimation.gaussian.search import search, starts_about
+from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Belief
-from agent.estimation.posterior import Hypothesis, Posterior
-from agent.peer.motion_log import MotionLog
+from agent.estimation.posterior import Posterior
 from agent.planning import pair_claim
 from agent.planning.accuracy_seeking import OFF_RADIUS
 from agent.planning.assured import Assured
@@ -30,13 +24,12 @@ from agent.planning.tasks import Aligning, Radial
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.recording.summary_json import summary
-from protocol.messages import Ranged, Undecided
+from protocol.messages import Undecided
 from protocol.motion import Pose, compose, inverse
 from protocol.noise import Noise
-from protocol.wire import encode
 from tests.missions import own_ranges
-from tests.pair_starts import alone
 from tests.series import series
+from tests.steps import steps
 from tests.surveys import ODOMETRY, SIGMA, WHEELS, assert_localised, scenario_of, states, survey
 from world.scenario import Scenario
 from world.sensors import mutual_ranges
@@ -272,60 +265,11 @@ SHORT = 6
 """The seed of a short mission."""
 
 
-def ticks(scenario: Scenario) -> Iterator[tuple[World, dict[str, RobotState], dict[str, RobotState]]]:
-    """Yield the world and the states before and after `observe`, each step compared with that of a copy."""
-    world = release(scenario)
-    states = {robot.id: RobotState(scenario.config(robot.id)) for robot in scenario.robots}
-    while isinstance(world, World):
-        sensed = observations(world)
-        observed = {
-            observation.robot: PLANNER.observe(states[observation.robot], observation)
-            for observation in sensed
-        }
-        yield world, states, observed
-        told = {robot: PLANNER.report(state) for robot, state in observed.items()}
-        states = {
-            observation.robot: PLANNER.decide(
-                observed[observation.robot], [told[one.peer] for one in observation.contacts]
-            )
-            for observation in sensed
-        }
-        onward = advance(world, {robot: PLANNER.command(state) for robot, state in states.items()})
-        if not isinstance(onward, World):
-            assert onward.outcome == "localised"
-            return
-        world = onward
-
-
-@pytest.mark.long
-def test_a_decision_depends_only_on_the_state_and_leaves_it_unchanged() -> None:
-    for world, before, observed in ticks(scenario_of(NOISES["everything"], SHORT)):
-        told = {robot: PLANNER.report(state) for robot, state in observed.items()}
-        for observation in observations(world):
-            state, once = before[observation.robot], observed[observation.robot]
-            was = repr(state)
-            again = PLANNER.observe(copy.deepcopy(state), observation)
-            assert once == again
-            assert repr(once) == repr(again)
-            assert repr(state) == was
-            heard = [told[contact.peer] for contact in observation.contacts]
-            was = repr(once)
-            decided, anew = (
-                PLANNER.decide(once, heard),
-                PLANNER.decide(copy.deepcopy(again), list(heard)),
-            )
-            assert decided == anew
-            assert repr(decided) == repr(anew)
-            assert repr(once) == was
-            for say in (PLANNER.command, PLANNER.report, PLANNER.estimate):
-                assert encode(say(decided)) == encode(say(anew))
-
-
 def test_both_robots_have_the_same_hypotheses_while_reports_arrive() -> None:
     """Both use the same logs and arithmetic, so neither waits for a claim of the other."""
     held = 0
-    for _, current, _ in ticks(scenario_of(SIGMA, 4)):
-        a, b = current["a"], current["b"]
+    for step in steps(scenario_of(SIGMA, 4)):
+        a, b = step.before["a"], step.before["b"]
         if a.belief.pair and b.belief.pair:
             assert a.belief.pair == b.belief.pair
             assert a.belief.blocking_reason == b.belief.blocking_reason
@@ -334,11 +278,10 @@ def test_both_robots_have_the_same_hypotheses_while_reports_arrive() -> None:
 
 
 def test_a_robot_whose_peer_gives_up_under_noise_gives_up_too() -> None:
-    for world, _, observed in ticks(scenario_of(SIGMA, 4)):
-        (by_a, _) = observations(world)
-        if by_a.contacts:
-            told = replace(PLANNER.report(observed["b"]), verdict=Undecided("no way"))
-            assert PLANNER.decide(observed["a"], [told]).verdict == Undecided("b reports: no way")
+    for step in steps(scenario_of(SIGMA, 4)):
+        if step.heard["a"]:
+            told = replace(step.heard["a"][0], verdict=Undecided("no way"))
+            assert PLANNER.decide(step.observed["a"], [told]).verdict == Undecided("b reports: no way")
             return
     pytest.fail("they never met")
 
@@ -357,20 +300,6 @@ def first_impossible(count: int) -> list[int]:
 def test_a_robot_whose_first_range_is_impossible_localises() -> None:
     for seed in first_impossible(4):
         assert_localised(survey(MANY, seed))
-
-
-def test_a_waiting_robot_fits_its_anchor_again_when_a_quarter_more_ranges_are_in() -> None:
-    own = alone(track(np.ones(2), np.ones(2), 1.0), [1.0, 1.0, 1.0], Noise(0.1, 0.1))
-    (fit,) = fits(own, starts_about([np.ones(2)]))
-
-    def due(fitted: int, ranges: int, probability: float = 1.0) -> bool:
-        belief = Belief(own=(Hypothesis(probability, fit),), ranges_at_last_fit=fitted)
-        log = MotionLog(ranges=tuple([Ranged(tick, 1.0) for tick in range(ranges)]))
-        return inference.is_fit_due(RobotState(scenario_of(SIGMA, 1).config("b"), log=log, belief=belief))
-
-    assert [due(8, ranges) for ranges in (8, 9, 10)] == [False, False, True]
-    assert [due(100, ranges) for ranges in (104, 105)] == [False, True]
-    assert due(100, 101, probability=0.99), "the branch is not certain"
 
 
 def test_drop_outs_that_add_up_do_not_keep_a_robot_in_phase_1() -> None:
