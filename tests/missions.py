@@ -53,3 +53,9 @@ def kept(scenario: Scenario) -> dict[str, list[bytes]]:
     books = {name: MemoryJournal() for name in in_process.journals(scenario)}
     in_process.played(scenario, books)
     return {name: book.frames for name, book in books.items()}
+
+
+def outcome(run: Run) -> str:
+    """Return the outcome of a run that has ended."""
+    assert run.end is not None
+    return run.end.outcome

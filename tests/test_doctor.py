@@ -27,7 +27,6 @@ from agent.estimation import compiled
 from compose import extras
 from compose.doctor.certificate_checks import certificate_findings
 from compose.doctor.network_checks import APART_S, compared
-from compose.extras import Library
 from compose.launch.processes import free_endpoint
 from compose.network import KEYED
 from protocol.network import keys as tree
@@ -128,22 +127,6 @@ def test_without_the_compiled_estimator_a_mission_that_needs_it_does_not_begin(o
     assert (status, out) == (3, "")
     begin = f"tandem run: cannot continue: {other_kernel}: the estimator is not compiled: "
     assert re.fullmatch(f"{re.escape(begin)}.*; install Tandem again .*\n", err)
-
-
-@pytest.mark.parametrize(
-    ("version", "fits"),
-    [
-        ("1.9.9", False),
-        ("1.10", True),
-        ("1.10.0", True),
-        ("1.10.2rc1", True),
-        ("2.0.0", False),
-        ("2", False),
-        (None, False),
-    ],
-)
-def test_a_library_fits_within_its_bounds(version: str | None, fits: bool) -> None:
-    assert Library("eclipse-zenoh", version, "<2,>=1.10").fits is fits
 
 
 def test_a_free_port_is_reported_and_a_port_in_use_is_a_problem() -> None:

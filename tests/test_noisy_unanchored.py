@@ -39,7 +39,7 @@ from tests.commands import TandemProcess
 from tests.commands import journals as journals_of
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised
-from tests.missions import kept
+from tests.missions import kept, outcome
 from tests.test_group_runs import audited
 from tests.test_unanchored import bound, four, last_claim, scenario_of, table_with
 from world.scenario import Scenario
@@ -91,8 +91,7 @@ def of_finders(run: Run) -> list[float]:
 
 def test_robots_without_an_anchor_are_localised_under_noise_within_the_bound() -> None:
     run = of_frames(journals())
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     assert localised(run) == {"a", "b", "u", "v"}
     assert last_claim(run) <= bound(run.scenario)
     for robot in ("u", "v"):
@@ -142,8 +141,7 @@ def test_a_recording_with_other_noise_is_audited_and_replayed_without_a_finding(
     if world:
         table["world"] = {"noise": world}
     run = of_frames(kept(noisy(table, **noise)))
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     assert audit_run(run).violations == ()
     assert replayed(run).differences == ()
 
@@ -175,8 +173,7 @@ def test_reports_under_odometry_noise_fit_in_a_frame_and_no_claim_is_wrong() -> 
         for framed in one_step.received
     ]
     assert max(sizes) <= MAX_REPORT_BYTES
-    assert run.end is not None
-    assert run.end.outcome in ("localised", "undecided")
+    assert outcome(run) in ("localised", "undecided")
 
 
 @pytest.mark.long("slow")
@@ -208,8 +205,7 @@ def test_larger_errors_than_told_lead_to_no_wrong_claim() -> None:
         world = {"anchor_sigma": 0.075, "mutual_sigma": 0.075, "odometry": {"scale": -0.01}}
         table["world"] = {"noise": world}
         run = run_mission(noisy(table))
-        assert run.end is not None
-        assert run.end.outcome != "wrong", (seed, run.end)
+        assert outcome(run) != "wrong", (seed, run.end)
 
 
 @pytest.mark.long
@@ -222,8 +218,7 @@ def test_a_robot_whose_fit_has_ended_in_a_wrong_optimum_passes_on_no_pose() -> N
     run = of_frames(kept(replace(planned, mission=replace(planned.mission, accuracy=0.3), max_ticks=330)))
     assert of_finders(run)
     assert max(of_finders(run)) < 16.3
-    assert run.end is not None
-    assert run.end.outcome != "wrong"
+    assert outcome(run) != "wrong"
 
 
 # --- meetings that contradict each other -----------------------------------------------------------------
@@ -364,8 +359,7 @@ def test_robots_are_localised_at_an_accuracy_just_above_the_one_that_is_refused(
     for seed in range(1, 4):
         table = four(seed=seed)
         run = run_mission(noisy(table, accuracy=0.03, **CALIBRATED))
-        assert run.end is not None
-        assert run.end.outcome == "localised"
+        assert outcome(run) == "localised"
 
 
 @pytest.mark.parametrize("kind", ["v", "omega", "v_floor", "omega_floor"])

@@ -16,11 +16,7 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import LEAST_LEVEL, noise_level, residual_correlation
 from agent.estimation.gaussian.odometry_noise import (
     Array,
-    Errors,
     Track,
-    constant_errors,
-    corrected,
-    rescaled,
     track,
 )
 from agent.estimation.gaussian.own_sensors import doubt
@@ -31,7 +27,7 @@ from agent.estimation.gaussian.search import starts_about
 from agent.peer.peer_state import PeerState
 from agent.planning.assured import Assured
 from agent.planning.plausibility import objection
-from compose.errors import BadScenario, Unworkable
+from compose.errors import Unworkable
 from compose.launch.in_process import run_mission
 from compose.recording.reasons import reason_for
 from compose.scenario import scenario_file
@@ -76,17 +72,6 @@ def test_a_profile_is_a_table_of_noise_and_fields_beside_it_replace_its_values()
     assert by_name == parsed('{profile = "uwb"}').mission.noise
     other = parsed('{profile = "uwb", range_bias = 0.1}').mission.noise
     assert other == replace(by_name, range_bias=0.1)
-
-
-@pytest.mark.parametrize("noise", ['"ubw"', '{profile = "ubw"}'])
-def test_an_unknown_profile_is_one_line_with_the_known_ones(noise: str) -> None:
-    with pytest.raises(BadScenario) as raised:
-        parsed(noise)
-    line = str(raised.value)
-    assert "mission.noise.profile" in line
-    assert "ubw" in line
-    assert "\n" not in line
-    assert all(name in line for name in PROFILES)
 
 
 @pytest.mark.parametrize("name", PROFILES)
@@ -211,25 +196,6 @@ def test_a_bias_of_all_ranges_is_no_correlation_of_their_errors() -> None:
     """It is estimated. Taken for correlation, it made the noise level 3, and most robots never claimed."""
     noise = Noise(0.05, 0.05, range_bias=0.4)
     assert np.mean([drawn(seed, noise)[1] for seed in range(40)]) == pytest.approx(1.0, abs=0.2)
-
-
-def test_errors_keep_their_size_under_other_priors() -> None:
-    path = track(np.full(4, 0.5), np.full(4, 0.2), 1.0)
-    told, other = Noise(0.05, 0.05), Noise(0.05, 0.05, wheel_scale=0.02, gyro_bias=0.001)
-    errors = Errors(np.zeros(4), np.zeros(4), np.array((1.0, -2.0, 0.5)))
-    again = rescaled(errors, told, other)
-    before, after = (
-        corrected(
-            np.stack((path.v, path.omega)),
-            np.tensordot(one.constant, constant_errors(path.v, path.omega, noise), 1),
-            path.period,
-        )
-        for one, noise in ((errors, told), (again, other))
-    )
-    assert after.x == pytest.approx(before.x)
-    assert after.heading == pytest.approx(before.heading)
-    assert len(rescaled(errors, told, told.as_told).constant) == 0
-    assert rescaled(rescaled(errors, told, told.as_told), told.as_told, told).constant.tolist() == [0.0] * 3
 
 
 @pytest.mark.parametrize("outliers", [0.0, 0.05])

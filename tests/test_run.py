@@ -259,13 +259,6 @@ def test_in_process_leaves_the_same_bytes_from_random_starts(seed: int, tmp_path
     same_in_process(out, tmp_path / "again", *arguments)
 
 
-def test_the_seed_draws_the_starts(tmp_path: Path) -> None:
-    for seed in ("1", "2"):
-        tandem("run", "random", "--seed", seed, "--in-process", "-q", "--out", tmp_path / seed)
-    one, other = (ticks(tmp_path / seed)[0] for seed in ("1", "2"))
-    assert (one["x"], one["y"], one["heading"]) != (other["x"], other["y"], other["heading"])
-
-
 # --- output -----------------------------------------------------------------------------------------
 
 
@@ -288,20 +281,14 @@ def test_the_table_at_the_end_has_the_result_of_each_robot() -> None:
             assert sum(figure in word for word in rows[robot]) == 2, ended.out
 
 
-def test_a_closed_output_is_one_line_and_no_traceback() -> None:
-    with (
-        Path("/dev/full").open("wb") as full,
-        TandemProcess("run", "paper-1", "-q", terminal=full.fileno()) as run,
-    ):
-        ended = run.ended()
-    assert ended.status == 3
-    assert ended.err == "tandem run: cannot continue: No space left on device\n"
-
-
-def test_the_version_on_a_full_disk_is_one_line_and_no_traceback() -> None:
-    with Path("/dev/full").open("wb") as full, TandemProcess("--version", terminal=full.fileno()) as run:
-        ended = run.ended()
-    assert (ended.status, ended.err) == (3, "tandem: cannot continue: No space left on device\n")
+@pytest.mark.parametrize(
+    "words", [["run", "paper-1", "-q"], ["--version"], ["world", "paper-1", "--listen", free_endpoint()]]
+)
+def test_a_closed_output_is_one_line_and_no_traceback(words: list[str]) -> None:
+    with Path("/dev/full").open("wb") as full, TandemProcess(*words, terminal=full.fileno()) as command:
+        ended = command.ended()
+    name = "tandem" if words[0].startswith("-") else f"tandem {words[0]}"
+    assert (ended.status, ended.err) == (3, f"{name}: cannot continue: No space left on device\n")
 
 
 def test_a_mistake_has_its_exit_status_where_it_cannot_be_printed(tmp_path: Path) -> None:
@@ -321,23 +308,12 @@ def test_a_message_that_cannot_be_printed_does_not_end_a_mission() -> None:
         assert run.ended() == (0, "localised after 48 ticks\n", "")
 
 
-def test_a_world_with_a_closed_output_does_not_blame_its_journal(tmp_path: Path) -> None:
-    options = ("--listen", free_endpoint(), "--out", tmp_path / "out")
-    with (
-        Path("/dev/full").open("wb") as full,
-        TandemProcess("world", "paper-1", *options, terminal=full.fileno()) as run,
-    ):
-        ended = run.ended()
-    assert ended.status == 3
-    assert ended.err == "tandem world: cannot continue: No space left on device\n"
-
-
 def test_a_terminal_shows_one_line_with_the_tick_and_the_outcomes_while_it_runs() -> None:
-    status, shown = on_a_terminal("run", "far")
-    assert status == 0
-    assert "localised after" in shown
-    drawn = re.findall(r"far, tick \d+ of \d+ at most: ((?:\d|waiting for \d)[^\r\n\x1b]*)", shown)
-    assert len(drawn) == shown.count("far, tick ")
+    status, shown = on_a_terminal("run", "paper-1", "--rate", "20")
+    assert status in OVER
+    assert re.search(r"(localised|undecided) after \d+ ticks", shown)
+    drawn = re.findall(r"paper-1, tick \d+ of \d+ at most: ((?:\d|waiting for \d)[^\r\n\x1b]*)", shown)
+    assert len(drawn) == shown.count("paper-1, tick ")
     assert any("2 no verdict yet" in frame for frame in drawn)
 
 

@@ -18,6 +18,7 @@ from compose.recording.closest_approach import nearest
 from compose.scenario.scenario_file import load, validate
 from protocol.motion import Controls, Pose, step
 from tests.commands import tandem
+from tests.missions import outcome
 from tests.series import series
 from world.scenario import Scenario
 
@@ -72,8 +73,7 @@ def test_robots_that_may_come_near_do() -> None:
 @pytest.mark.parametrize("seed", series([NEAR, *range(1, 40)], 10))
 def test_none_comes_nearer_and_both_localise(seed: int) -> None:
     recording = run_mission(safe(seed))
-    assert recording.end is not None
-    assert recording.end.outcome == "localised"
+    assert outcome(recording) == "localised"
     found = nearest(recording)
     assert found is not None
     assert found >= SAFE
@@ -82,8 +82,7 @@ def test_none_comes_nearer_and_both_localise(seed: int) -> None:
 @pytest.mark.parametrize("seed", series(range(1, 9), 2))
 def test_none_comes_nearer_under_noise(seed: int) -> None:
     recording = run_mission(safe(seed, anchor_sigma=0.05, mutual_sigma=0.05))
-    assert recording.end is not None
-    assert recording.end.outcome == "localised"
+    assert outcome(recording) == "localised"
     found = nearest(recording)
     assert found is not None
     assert found >= SAFE
@@ -104,8 +103,7 @@ def test_none_comes_nearer_however_many_reports_are_lost_or_late(seed: int, loss
     faults = [f"a<->b: loss={loss:.3f}", f"b->a: delay={least}..{least + 3}"]
     scenario = load("random", seed=seed, faults=faults)
     recording = run_mission(replace(scenario, mission=replace(scenario.mission, safety_distance=SAFE)))
-    assert recording.end is not None
-    assert recording.end.outcome == "localised"
+    assert outcome(recording) == "localised"
     found = nearest(recording)
     assert found is not None
     assert found >= SAFE
@@ -126,8 +124,7 @@ def test_robots_that_begin_in_range_of_each_other_come_no_nearer_than_that(seed:
         "max_ticks": 60,
     }
     recording = run_mission(validate(table, "near.toml").seeded(seed))
-    assert recording.end is not None
-    assert recording.end.outcome in ("localised", "undecided")
+    assert outcome(recording) in ("localised", "undecided")
     a, b = recording.ticks[0].truth.poses
     found = nearest(recording)
     assert found is not None

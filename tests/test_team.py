@@ -45,7 +45,7 @@ from protocol.team_motion import spiral
 from protocol.wire import decode, encode
 from tests.commands import journals
 from tests.commands import tandem as tandem_command
-from tests.missions import kept
+from tests.missions import kept, outcome
 from tests.moving_groups import PERIOD_S, moving_group
 from tests.series import series
 from world.hardware.driver import Reading
@@ -92,8 +92,7 @@ ALONE = '[[robot]]\nid = "a"\nstart = [1.0, 1.0, 0.5]'
 
 def test_a_robot_alone_in_a_room_is_localised() -> None:
     run = run_mission(team(ALONE))
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     claim = run.claim("a")
     assert claim is not None
     assert claim.position_error < 0.3
@@ -104,16 +103,14 @@ def test_an_anchor_that_is_not_in_the_list_of_a_robot_is_not_ranged() -> None:
     run = run_mission(team(ALONE + '\nanchors = ["A1", "A3"]'))
     ranged = {one.anchor for seen in run.observations for one in seen["a"].anchors}
     assert ranged == {"A1", "A3"}
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     everything = {one.anchor for one in observations(release(team(ALONE)))[0].anchors}
     assert everything == {"A1", "A2", "A3"}
 
 
 def test_poses_without_anchors_are_those_in_the_frame_of_the_first_robot() -> None:
     run = run_mission(load("relative"))
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     first = run.truth("a")[0]
     assert (first.x, first.y, first.heading) == (0.0, 0.0, 0.0)
     assert not any(seen[robot].anchors for seen in run.observations for robot in seen)
@@ -123,8 +120,7 @@ def test_a_robot_with_three_ranges_keeps_no_other_one_from_its_claim() -> None:
     """Fits of the third one end where no step descends: its ranges are explained by their linear model."""
     exact = MISSION.replace("0.05", "0.0").replace("accuracy", 'frame = "relative"\naccuracy')
     run = run_mission(parse(f'name = "met"\nseed = 3199\n{exact}[team]\nrobots = 3\nside = 10.0', "met"))
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     assert run.end.tick < 30
 
 
@@ -134,8 +130,7 @@ def test_an_anchor_off_its_survey_is_named_before_its_ranges_pass_as_strays() ->
     x, y = table["anchor"][0]["position"]
     table["anchor"][0]["stands"] = [x + 0.208, y - 0.216]
     run = run_mission(replace(template_of(table).scenario, max_ticks=8))
-    assert run.end is not None
-    assert run.end.outcome == "undecided"
+    assert outcome(run) == "undecided"
     assert any("anchor A1 seems to stand elsewhere" in (one.text or "") for one in run.end.causes)
 
 
@@ -213,8 +208,7 @@ SCATTERED = team(APART, "", MISSION.replace("0.05", "0.0") + '\nframe = "relativ
 
 def test_the_first_robot_searches_for_one_that_starts_out_of_range_and_stands() -> None:
     run = run_mission(SCATTERED)
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     assert run.end.tick * run.scenario.mission.period <= run.scenario.t_max
     met = next(seen["b"].tick for seen in run.observations if seen["b"].contacts)
     assert met > 10
@@ -240,8 +234,7 @@ def test_robots_of_a_team_keep_the_safety_distance(frame: str) -> None:
     drawn = "[team]\nrobots = 4\nside = 4.0\n" + ("" if frame else "anchors = 2\n")
     text = f'name = "apart"\nseed = 2\n{MISSION}safety_distance = 0.6\n{frame}{drawn}'
     run = of_frames(kept(parse(text, "apart")))
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     assert audit_run(run).violations == ()
     assert summary(run, None, None)["nearest_m"] >= 0.6
 
@@ -308,8 +301,7 @@ def test_loss_delay_and_duplication_of_reports_change_ticks_only(seed: int) -> N
     text = f"{mission}\n{robots}\n{fault}"
     scenario = parse(f'name = "faulty"\nseed = {seed}\n{text}', "faulty")
     run = of_frames(kept(scenario))
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     assert audit_run(run).violations == ()
 
 
