@@ -8,7 +8,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -263,24 +262,6 @@ def test_a_wait_for_a_line_ends_with_a_frame_another_event_or_the_timeout() -> N
     inbox.put("ended", "agent b")
     assert inbox.next(BOUND_S) == Arrival("ended", "agent b"), "without a session"
     assert inbox.next(0.01) is NO_ARRIVAL
-
-
-def test_a_flood_of_a_line_and_a_flood_of_events_wait_for_each_other() -> None:
-    with taking_from_a_line() as (inbox, link):
-        for _ in range(10):
-            inbox.put("ended", "agent a")
-            link.put(keys.command(RUN, "a"), FRAMES[2])
-        topics = [inbox.next(BOUND_S).topic for _ in range(20)]
-        assert inbox.next(0.0) is NO_ARRIVAL
-    assert all(len(set(topics[i : i + 4])) == 2 for i in range(0, 12, 4)), topics
-
-
-def test_what_a_line_has_no_room_for_replaces_the_oldest() -> None:
-    with taking_from_a_line() as (inbox, link):
-        for number in range(session.LINE_FRAMES + 3):
-            link.put(keys.command(RUN, "a"), str(number).encode())
-        came = list(iter(partial(inbox.next, 0.0), NO_ARRIVAL))
-    assert [int(arrival.frame) for arrival in came] == [*range(3, session.LINE_FRAMES + 3)]
 
 
 def test_what_comes_over_a_line_under_a_wildcard_is_refused() -> None:

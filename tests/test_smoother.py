@@ -12,7 +12,7 @@ from msgspec.structs import replace
 
 from agent.estimation import gauss_newton, smoother
 from agent.estimation.fit import Start, fits
-from agent.estimation.gauss_newton import Convergence, Fitted, Point, moved, point_at
+from agent.estimation.gauss_newton import Convergence, Fitted, Point, point_at
 from agent.estimation.gaussian.joint_ranges import PosePrior
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
@@ -201,56 +201,6 @@ def test_a_delay_of_the_ranges_is_estimated_within_its_sigma() -> None:
         off.append((group.delay / 0.3 - fit.constants[column]) / fit.constant_sigmas[column])
     assert max(map(abs, off)) < 4.0
     assert 6.0 < np.sum(np.square(off)) < 42.0  # chi-square of 20 degrees of freedom: 0.2 and 99.7 %
-
-
-def dense(problem: Problem, poses: Array, constant: Array, white: Array) -> tuple[Array, Array, Array]:
-    """Return the least-squares problem at a point: J, right side, changes of poses and all errors."""
-    of, small = problem.measured, 1e-6
-    kernel, n3, m = problem.kernel, 3 * of.robots, of.patterns.shape[1]
-    sizes = np.sqrt(of.white)
-
-    def predicted(x: Array) -> Array:
-        start, common, own, errors = np.split(x, np.cumsum([n3, of.common.shape[1], of.robots * m]))
-        walk = kernel.walked(
-            moved(of, poses, start), own.reshape(-1, m), errors.reshape(of.white.shape) * sizes
-        )
-        return of.rho - walk.residual + of.common @ common
-
-    x = np.concatenate(
-        (np.zeros(n3), np.zeros(of.common.shape[1]), constant.ravel(), (white / sizes).ravel())
-    )
-    columns = [(predicted(x + step) - predicted(x - step)) / (2.0 * small) for step in small * np.eye(len(x))]
-    rows, priors = np.stack(columns, 1) / problem.weighing.sigma[:, None], np.eye(len(x))[n3:]
-    right = np.concatenate(((of.rho - predicted(x)) / problem.weighing.sigma, -x[n3:]))
-    return np.concatenate((rows, priors)), right, x
-
-
-@pytest.mark.parametrize("seed", [1, 2])
-def test_a_step_is_that_of_least_squares_with_all_errors_as_unknowns(seed: int) -> None:
-    problem = problem_of(seed, 2, 5, slow=0.0, survey=0.0, prior=False)
-    of = problem.measured
-    poses, constant, white = point_of(of, seed)
-    constant, white, kernel = 0.3 * constant, 0.3 * white, problem.kernel
-    step = kernel.step(
-        kernel.walked(poses, constant, white), poses, np.square(problem.weighing.sigma), 0.0, np.inf
-    )
-    while not np.array_equal(step.change, step.limited):  # to a place from where no step is limited
-        poses = moved(of, poses, step.limited[: 3 * of.robots])
-        walk = kernel.walked(poses, constant, white)
-        step = kernel.step(walk, poses, np.square(problem.weighing.sigma), 0.0, np.inf)
-    jacobian, right, x = dense(problem, poses, constant, white)
-    change, *_ = np.linalg.lstsq(jacobian, right)
-    after, size = x + change, of.size
-    n3 = 3 * of.robots
-    np.testing.assert_allclose(step.change[:n3], change[:n3], atol=1e-4 * np.max(np.abs(change[:n3])))
-    np.testing.assert_allclose(step.change[n3:], after[n3:size], atol=1e-4)
-    np.testing.assert_allclose(
-        step.white / np.sqrt(of.white), after[size:].reshape(of.white.shape), atol=1e-4
-    )
-    inverse = np.linalg.inv(jacobian.T @ jacobian)[:size, :size]
-    np.testing.assert_allclose(step.inverse, inverse, rtol=1e-3, atol=1e-6 * np.max(inverse))
-    left = right - jacobian @ change
-    assert step.chi2 == pytest.approx(float(left @ left), rel=1e-4)
 
 
 def test_each_range_is_weighed_by_the_prediction_from_all_others() -> None:
