@@ -107,86 +107,63 @@ AXIS = 'field = "robot.b.anchor[0]"\nvalues = [10.0, 8]'
 JOINT = 'name = "both"\nfields = ["mission.period", "mission.max_speed"]\nvalues = [[1.0, 1.0], [0.5, 1.0]]'
 
 
-@pytest.mark.parametrize(
-    ("was", "new", "says"),
-    [
-        ('name = "both"', "name = 1", "name: expected"),
-        ('name = "both"', 'name = "a b"', "name: invalid name"),
-        ("trials = 12", "", "missing field 'trials'"),
-        ("trials = 12", "trials = 0", "trials: "),
-        ("trials = 12", 'trials = "12"', "trials: "),
-        ("trials = 12", "trails = 12", "unknown field 'trails'"),
-        ("seed = 5", "seed = -1", "seed: "),
-        ("seed = 5", "trial_timeout = 0", "trial_timeout: "),
-        ("base.toml", "absent.toml", "scenario: 'absent.toml' is neither"),
-        ("base.toml", "both.toml/x", "scenario: "),
-        ("name", "name = ", "not TOML"),
-        ("paired = true", "paird = true", "axis[1]: unknown field 'paird'"),
-        (
-            "robot.b.anchor[0]",
-            "robot.b.anker",
-            "axis[0].field: 'robot.b.anker': robot[1] has no field 'anker'",
-        ),
-        (
-            "robot.b.anchor[0]",
-            "robot.c.anchor",
-            "axis[0].field: 'robot.c.anchor': the base scenario has no robot",
-        ),
-        (
-            "robot.b.anchor[0]",
-            "robot[2].anchor",
-            "axis[0].field: 'robot[2].anchor': the base scenario has no",
-        ),
-        (
-            "robot.b.anchor[0]",
-            "mission.noise.odometry.w",
-            "axis[0].field: 'mission.noise.odometry.w': mission.noise.odometry has no field 'w'",
-        ),
-        (
-            "robot.b.anchor[0]",
-            "mission.noise.outlier_bias[0]",
-            "axis[0].field: 'mission.noise.outlier_bias[0]': the base scenario has no mission.noise.out",
-        ),
-        ("robot.b.anchor[0]", "robot..anchor", "axis[0].field: 'robot..anchor': not a path"),
-        (
-            "robot.b.anchor[0]",
-            "mission.period.x",
-            "axis[0].field: 'mission.period.x': mission.period is a single",
-        ),
-        ("robot.b.anchor[0]", "seed", "axis[0].field: 'seed': every trial has its own seed"),
-        ("robot.b.anchor[0]", "planner", "axis[1]: 'planner.name' is already set by axis[0] ('planner')"),
-        ("robot.b.anchor[0]", "planner.name", "axis[1]: another axis has the name 'planner.name'"),
-        ("[10.0, 8]", "[]", "axis[0].values: "),
-        ("[10.0, 8]", "[8, 8.0]", "axis[0].values[1]: equal to values[0]"),
-        ("[10.0, 8]", "[8, 1979-05-27]", "axis[0].values[1]: must be a number"),
-        ("[10.0, 8]", "[8, nan]", "axis[0].values[1]: must be a number"),
-        (
-            "[10.0, 8]",
-            '[8, "x"]',
-            "cell 2 (robot.b.anchor[0] = x; planner.name = paper): robot[1].anchor[0]: ",
-        ),
-        ("[10.0, 8]", "[8, 0]", "cell 2 (robot.b.anchor[0] = 0; planner.name = paper): robot[1].anchor: "),
-        ('field = "robot.b.anchor[0]"', "", "axis[0]: needs either 'field', or 'name'"),
-        (AXIS, AXIS + '\nlabels = ["x", "y"]', "axis[0].name: missing"),
-        (AXIS, AXIS + '\nname = "D"\nlabels = ["x", "x"]', "axis[0].labels: must be 2 different labels"),
-        (AXIS, AXIS + '\nname = "rate"\nlabels = ["x", "y"]', "axis: 2 columns would have the name 'rate'"),
-        (AXIS, JOINT.replace('name = "both"', ""), "axis[0].name: missing"),
-        (AXIS, JOINT.replace("[0.5, 1.0]", "[0.5]"), "axis[0].values[1]: must be a list of 2 values"),
-        (
-            AXIS,
-            JOINT.replace("mission.period", "mission.perod"),
-            "axis[0].fields[0]: 'mission.perod': mission has no",
-        ),
-    ],
-)
-def test_a_mistake_in_a_spec_is_one_line_that_names_the_field(
-    was: str, new: str, says: str, folder: Path
-) -> None:
+MISTAKES = {
+    'name = "both"': {"name = 1": "name: expected", 'name = "a b"': "name: invalid name"},
+    "trials = 12": {
+        "": "missing field 'trials'",
+        "trials = 0": "trials: ",
+        'trials = "12"': "trials: ",
+        "trails = 12": "unknown field 'trails'",
+    },
+    "seed = 5": {"seed = -1": "seed: ", "trial_timeout = 0": "trial_timeout: "},
+    "base.toml": {"absent.toml": "scenario: 'absent.toml' is neither", "both.toml/x": "scenario: "},
+    "name": {"name = ": "not TOML"},
+    "paired = true": {"paird = true": "axis[1]: unknown field 'paird'"},
+    "robot.b.anchor[0]": {
+        "seed": "axis[0].field: 'seed': every trial has its own seed",
+        "planner": "axis[1]: 'planner.name' is already set by axis[0] ('planner')",
+        "planner.name": "axis[1]: another axis has the name 'planner.name'",
+        **{
+            field: f"axis[0].field: '{field}': {why}"
+            for field, why in {
+                "robot.b.anker": "robot[1] has no field 'anker'",
+                "robot.c.anchor": "the base scenario has no robot",
+                "robot[2].anchor": "the base scenario has no",
+                "mission.noise.odometry.w": "mission.noise.odometry has no field 'w'",
+                "mission.noise.outlier_bias[0]": "the base scenario has no mission.noise.out",
+                "robot..anchor": "not a path",
+                "mission.period.x": "mission.period is a single",
+            }.items()
+        },
+    },
+    "[10.0, 8]": {
+        "[]": "axis[0].values: ",
+        "[8, 8.0]": "axis[0].values[1]: equal to values[0]",
+        "[8, 1979-05-27]": "axis[0].values[1]: must be a number",
+        "[8, nan]": "axis[0].values[1]: must be a number",
+        '[8, "x"]': "cell 2 (robot.b.anchor[0] = x; planner.name = paper): robot[1].anchor[0]: ",
+        "[8, 0]": "cell 2 (robot.b.anchor[0] = 0; planner.name = paper): robot[1].anchor: ",
+    },
+    'field = "robot.b.anchor[0]"': {"": "axis[0]: needs either 'field', or 'name'"},
+    AXIS: {
+        AXIS + '\nlabels = ["x", "y"]': "axis[0].name: missing",
+        AXIS + '\nname = "D"\nlabels = ["x", "x"]': "axis[0].labels: must be 2 different labels",
+        AXIS + '\nname = "rate"\nlabels = ["x", "y"]': "axis: 2 columns would have the name 'rate'",
+        JOINT.replace('name = "both"', ""): "axis[0].name: missing",
+        JOINT.replace("[0.5, 1.0]", "[0.5]"): "axis[0].values[1]: must be a list of 2 values",
+        JOINT.replace("n.period", "n.perod"): "axis[0].fields[0]: 'mission.perod': mission has no",
+    },
+}
+"""What is replaced in BOTH, by what, and what is then said."""
+
+
+@pytest.mark.parametrize(("was", "new"), [(was, new) for was in MISTAKES for new in MISTAKES[was]])
+def test_a_mistake_in_a_spec_is_one_line_that_names_the_field(was: str, new: str, folder: Path) -> None:
     assert was in BOTH
     (folder / "bad.toml").write_text(BOTH.replace(was, new, 1))
     with pytest.raises(UserError) as refused:
         played(folder, "bad.toml", "out")
-    assert str(refused.value).startswith(f"{folder / 'bad.toml'}: {says}")
+    assert str(refused.value).startswith(f"{folder / 'bad.toml'}: {MISTAKES[was][new]}")
     assert not (folder / "out").exists()
 
 
