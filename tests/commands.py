@@ -98,6 +98,11 @@ def several_pairs(pairs: int) -> str:
     return f'name = "pairs"\nseed = 5\n{SECTION_IV}' + "".join(robots)
 
 
+def anchored(**anchors: tuple[float, float]) -> str:
+    """Return the tables of robots that start by these anchors."""
+    return "".join(f'[[robot]]\nid = "{robot}"\nanchor = {list(at)}\n' for robot, at in anchors.items())
+
+
 class Ended(NamedTuple):
     """The result of a command that has ended."""
 

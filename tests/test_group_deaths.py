@@ -22,7 +22,7 @@ from compose.scenario.scenario_change import file_table
 from compose.scenario.scenario_file import load, parse, scenario_table, validate
 from compose.terminal.progress import result
 from protocol.messages import Undecided
-from tests.commands import SECTION_IV
+from tests.commands import SECTION_IV, anchored
 from tests.commands import tandem as tandem_command
 from tests.groups import group_of, localised, random_group
 from tests.series import series
@@ -37,15 +37,7 @@ seed = 1
 id = "a"
 anchor = [0.0, 0.0]
 dies = 20
-[[robot]]
-id = "b"
-anchor = [10.0, 3.0]
-[[robot]]
-id = "c"
-anchor = [-4.0, 9.0]
-[[robot]]
-id = "d"
-anchor = [5.0, -12.0]
+{anchored(b=(10.0, 3.0), c=(-4.0, 9.0), d=(5.0, -12.0))}
 """
 """A group in which a should meet d first."""
 

@@ -20,7 +20,17 @@ from protocol.journal import journal_file
 from protocol.messages import Observation
 from protocol.motion import Pose, step
 from protocol.wire import MAX_FRAME_BYTES, decode
-from tests.commands import BOUND_S, SECTION_IV, Ended, TandemProcess, processes_of, size, tandem, until
+from tests.commands import (
+    BOUND_S,
+    SECTION_IV,
+    Ended,
+    TandemProcess,
+    anchored,
+    processes_of,
+    size,
+    tandem,
+    until,
+)
 from tests.test_field import beacon, pose, told
 from world.hardware.driver_journal import OfDriver, driver_journal
 from world.hardware.termination import LAST_WORDS
@@ -42,12 +52,7 @@ UNANCHORED = f"""name = "four"
 seed = 24
 {SECTION_IV}
 area = [0.0, 0.0, 8.0, 6.0]
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-[[robot]]
-id = "b"
-anchor = [8.0, 1.0]
+{anchored(a=(0.0, 0.0), b=(8.0, 1.0))}
 [[robot]]
 id = "c"
 [[robot]]
@@ -63,15 +68,7 @@ tolerates = 1
 id = "a"
 anchor = [0.0, 0.0]
 attack = {{kind = "reframe", size = 1.0}}
-[[robot]]
-id = "b"
-anchor = [7.0, 1.0]
-[[robot]]
-id = "c"
-anchor = [3.0, 6.0]
-[[robot]]
-id = "d"
-anchor = [1.0, 3.0]
+{anchored(b=(7.0, 1.0), c=(3.0, 6.0), d=(1.0, 3.0))}
 [[robot]]
 id = "e"
 [[robot]]

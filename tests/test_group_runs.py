@@ -35,7 +35,7 @@ from compose.sweep.trial import Trial, row
 from compose.terminal.progress import result
 from protocol.journal.journal_file import CorruptJournal
 from protocol.wire import encode
-from tests.commands import OVER, SECTION_IV, TandemProcess, journals, processes_of, until
+from tests.commands import OVER, SECTION_IV, TandemProcess, anchored, journals, processes_of, until
 from tests.commands import tandem as tandem_command
 from tests.missions import kept
 from world.near_pairs import near_pairs
@@ -71,21 +71,7 @@ GROUP = f"""
 name = "group"
 seed = 3
 {SECTION_IV}
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-[[robot]]
-id = "b"
-anchor = [5.0, 1.0]
-[[robot]]
-id = "c"
-anchor = [2.0, 6.0]
-[[robot]]
-id = "d"
-anchor = [-4.0, 4.0]
-[[robot]]
-id = "e"
-anchor = [-3.0, -5.0]
+{anchored(a=(0.0, 0.0), b=(5.0, 1.0), c=(2.0, 6.0), d=(-4.0, 4.0), e=(-3.0, -5.0))}
 """
 Journals = dict[str, list[bytes]]
 

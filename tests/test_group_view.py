@@ -46,7 +46,7 @@ from protocol.messages import (
 )
 from protocol.motion import Pose
 from tests.browser import Open, inks, scrub_to, shot, watching
-from tests.commands import SECTION_IV, tandem
+from tests.commands import SECTION_IV, anchored, tandem
 from tests.conftest import recorded
 
 WAYS = {
@@ -64,18 +64,7 @@ CROWD = f"""
 name = "crowd"
 seed = 5
 {SECTION_IV}
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-[[robot]]
-id = "b"
-anchor = [1.5, 0.0]
-[[robot]]
-id = "c"
-anchor = [0.0, 1.5]
-[[robot]]
-id = "d"
-anchor = [1.5, 1.5]
+{anchored(a=(0.0, 0.0), b=(1.5, 0.0), c=(0.0, 1.5), d=(1.5, 1.5))}
 """
 """A group whose robots are in range of several others from the first tick on."""
 

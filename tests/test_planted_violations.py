@@ -34,10 +34,7 @@ from protocol.messages import (
 )
 from protocol.mission import Anchor
 from protocol.motion import Covariance, Segment
-from tests.commands import (
-    SECTION_IV,
-    several_pairs,
-)
+from tests.commands import SECTION_IV, anchored, several_pairs
 from tests.planted import (
     LAST,
     A,
@@ -74,12 +71,7 @@ noise.actuation = {{v = 0.01, omega = 0.01, v_floor = 1e-4, omega_floor = 1e-4}}
 noise.odometry = {{v = 0.01, omega = 0.01, v_floor = 1e-4, omega_floor = 1e-4}}
 [planner]
 name = "VARIANT"
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-[[robot]]
-id = "b"
-anchor = [6.0, 0.0]
+{anchored(a=(0.0, 0.0), b=(6.0, 0.0))}
 """
 
 
