@@ -18,7 +18,6 @@ from compose.recording.ranging.range_recording import FixedAnchor
 from tests.commands import tandem as command
 from tests.mutated_recordings import (
     End,
-    Tables,
     csv_text,
     mcap_bytes,
     pyfg_text,
@@ -26,6 +25,7 @@ from tests.mutated_recordings import (
     summary,
     trials,
 )
+from tests.recording_mutations import Tables
 from tests.test_house import HOUSE
 from tests.test_range_recordings import same as same_numbers
 

@@ -120,7 +120,8 @@ def test_a_robot_with_three_ranges_keeps_no_other_one_from_its_claim() -> None:
     """Fits of the third one end where no step descends: its ranges are explained by their linear model."""
     exact = MISSION.replace("0.05", "0.0").replace("accuracy", 'frame = "relative"\naccuracy')
     run = run_mission(parse(f'name = "met"\nseed = 3199\n{exact}[team]\nrobots = 3\nside = 10.0', "met"))
-    assert outcome(run) == "localised"
+    assert run.end is not None
+    assert run.end.outcome == "localised"
     assert run.end.tick < 30
 
 
@@ -130,7 +131,8 @@ def test_an_anchor_off_its_survey_is_named_before_its_ranges_pass_as_strays() ->
     x, y = table["anchor"][0]["position"]
     table["anchor"][0]["stands"] = [x + 0.208, y - 0.216]
     run = run_mission(replace(template_of(table).scenario, max_ticks=8))
-    assert outcome(run) == "undecided"
+    assert run.end is not None
+    assert run.end.outcome == "undecided"
     assert any("anchor A1 seems to stand elsewhere" in (one.text or "") for one in run.end.causes)
 
 
@@ -208,7 +210,8 @@ SCATTERED = team(APART, "", MISSION.replace("0.05", "0.0") + '\nframe = "relativ
 
 def test_the_first_robot_searches_for_one_that_starts_out_of_range_and_stands() -> None:
     run = run_mission(SCATTERED)
-    assert outcome(run) == "localised"
+    assert run.end is not None
+    assert run.end.outcome == "localised"
     assert run.end.tick * run.scenario.mission.period <= run.scenario.t_max
     met = next(seen["b"].tick for seen in run.observations if seen["b"].contacts)
     assert met > 10
