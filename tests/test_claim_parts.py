@@ -20,8 +20,8 @@ from compose.recording.ranging.range_recording import RangeRecording
 from docs import recorded_windows
 from docs.recorded_windows import is_wrong
 from protocol.noise import Noise
+from tests.range_tables import SAMPLE
 from tests.test_anchored import ANCHORS, driven
-from tests.test_estimate import SAMPLE
 
 SIGMA, SHARED_SIGMA, LASTS_S = 0.05, 0.2, 8.0
 

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from msgspec.structs import replace
 
-from agent.estimation.gaussian.contact_fit import ContactRanges, estimated
+from agent.estimation.gaussian.contact_fit import contact_measurements, estimated
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.planning.contacted import Contacted
 from agent.planning.unanchored import UnanchoredPlanner
@@ -21,7 +21,6 @@ from protocol.messages import (
     Estimate,
     Localised,
     Observation,
-    Ranged,
     Report,
     ReportedPose,
     RobotConfig,
@@ -64,28 +63,32 @@ def poses_of(pose: Pose, manoeuvres: list[tuple[float, float]]) -> list[Pose]:
     return found
 
 
-def contact(seed: int, sigma: float, times: int = 3) -> tuple[ContactRanges, Pose]:
-    """Return a contact with a finder whose position has this sigma (m), and the true pose at its end."""
+def contact_with(
+    sigma: float, seed: int, times: int = 3, x: float | None = None
+) -> tuple[JointMeasurements, Pose]:
+    """Return a contact with a finder whose position has this sigma (m), and the true pose at its end.
+
+    The finder reports another `x` (m), if there is one.
+    """
     rng = np.random.default_rng(seed)
     covariance = Covariance(0.5 * sigma**2, 0.0, 0.0, 0.5 * sigma**2, 0.0, 0.01**2)
     finder, angle = Pose(10.0, 20.0, rng.uniform(-3.0, 3.0)), rng.uniform(-math.pi, math.pi)
     own = Pose(10.0 + 1.8 * math.cos(angle), 20.0 + 1.8 * math.sin(angle), rng.uniform(-3.0, 3.0))
     there, here = poses_of(finder, FINDER * times), poses_of(own, OWN * times)
     errors = rng.normal(0.0, np.sqrt(np.diagonal(np.array(covariance.matrix)))).tolist()
-    told = Pose(finder.x + errors[0], finder.y + errors[1], finder.heading + errors[2])
+    told = Pose(finder.x + errors[0] if x is None else x, finder.y + errors[1], finder.heading + errors[2])
     ranges = [
-        Ranged(tick, math.hypot(one.x - other.x, one.y - other.y) + rng.normal(0.0, 0.05))
+        (tick, math.hypot(one.x - other.x, one.y - other.y) + rng.normal(0.0, 0.05))
         for tick, (one, other) in enumerate(zip(there, here, strict=True))
     ]
-    return ContactRanges(
-        told, covariance, path_of(FINDER * times), path_of(OWN * times), tuple(ranges)
-    ), here[-1]
+    paths = path_of(FINDER * times), path_of(OWN * times)
+    return contact_measurements(told, covariance, paths, ranges, MISSION), here[-1]
 
 
 @given(st.integers(0, 10**6), st.floats(0.01, 0.28))
 @settings(max_examples=12, deadline=None)
 def test_no_robot_knows_its_position_better_than_its_finder(seed: int, sigma: float) -> None:
-    measured, truth = contact(seed, sigma)
+    measured, truth = contact_with(sigma, seed)
     found = estimated(measured, MISSION)
     assert found is not None
     assert found.covariance.position_sigma >= sigma
@@ -94,15 +97,14 @@ def test_no_robot_knows_its_position_better_than_its_finder(seed: int, sigma: fl
 
 
 def test_a_finder_that_is_less_accurate_than_the_mission_asks_leads_to_no_claim() -> None:
-    found = estimated(contact(1, 0.4)[0], MISSION)
+    found = estimated(contact_with(0.4, 1)[0], MISSION)
     assert found is not None
     assert found.blocking_reason.startswith("the sigma of the position is 0.4")
 
 
 def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them() -> None:
     """An estimate beyond them could be sent and recorded, but not be read again."""
-    measured = contact(1, 0.1)[0]
-    found = [estimated(measured._replace(pose=replace(measured.pose, x=x)), MISSION) for x in (1e7, -1e7)]
+    found = [estimated(contact_with(0.1, 1, x=x)[0], MISSION) for x in (1e7, -1e7)]
     assert None in found
     for one in found:
         if one is not None:
@@ -114,7 +116,7 @@ def test_a_reference_at_the_bounds_of_messages_gives_no_estimate_beyond_them() -
 def test_the_covariances_of_contacts_are_right() -> None:
     scores = []
     for seed in range(200):
-        measured, truth = contact(seed, 0.1)
+        measured, truth = contact_with(0.1, seed)
         found = estimated(measured, MISSION)
         assert found is not None
         scores.append(nees(found.poses[0], truth, found.covariance))

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from itertools import product
 
 import pytest
 from msgspec.structs import replace
 
+from compose.errors import Unworkable
 from compose.sweep import execution, spec
-from compose.sweep.cells import RefusedCell, cells, setting_of
+from compose.sweep.cells import cells, setting_of
 from compose.sweep.table import schema_of
 from protocol.noise import Noise
 from tests.commands import tandem
@@ -21,8 +23,8 @@ def test_every_shipped_sweep_runs(name: str) -> None:
     sweep = spec.load(name)
     execution.check_columns(sweep, schema_of(sweep, list(cells(sweep))))
     for cell in cells(sweep):
-        setting = setting_of(sweep, cell)
-        assert isinstance(setting, RefusedCell) or setting.scenario.name == sweep.base["name"]
+        with suppress(Unworkable):
+            assert setting_of(sweep, cell).scenario.name == sweep.base["name"]
     assert f"{name:10} " in tandem("scenarios").out
 
 
@@ -36,7 +38,6 @@ def test_the_sweep_of_noise_has_the_same_starts_in_every_cell() -> None:
     hard = set()
     starts = set()
     for setting in settings:
-        assert not isinstance(setting, RefusedCell)
         scenario = setting.seeded(7)
         starts.add(tuple(robot.start for robot in scenario.robots))
         mission, noise = scenario.mission, scenario.mission.noise
@@ -59,9 +60,7 @@ def test_the_sweep_of_noise_has_the_same_starts_in_every_cell() -> None:
 @pytest.mark.parametrize(("name", "told"), [("mismatch", 1), ("mismatch-uwb", 2)])
 def test_the_sensors_of_each_row_of_mismatch_differ_whatever_robots_are_told(name: str, told: int) -> None:
     sweep = spec.load(name)
-    settings = [setting_of(sweep, cell) for cell in cells(sweep)]
-    scenarios = [one.scenario for one in settings if not isinstance(one, RefusedCell)]
-    assert len(scenarios) == len(settings)
+    scenarios = [setting_of(sweep, cell).scenario for cell in cells(sweep)]
     labels = [sweep.axes[-1].label(cell.place[-1]) for cell in cells(sweep)]
     informed = [place for place, label in enumerate(labels) if label.endswith(", told")]
     assert informed

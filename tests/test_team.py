@@ -16,9 +16,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import tandem
-from agent.estimation.facts import Facts
 from agent.estimation.gaussian.claim_agreement import united
-from agent.estimation.gaussian.measured_rows import joint_measurements
 from agent.estimation.gaussian.search import search
 from agent.estimation.posterior import carried
 from agent.estimation.team_measurements import TeamMeasurements
@@ -46,7 +44,7 @@ from protocol.wire import decode, encode
 from tests.commands import journals
 from tests.commands import tandem as tandem_command
 from tests.missions import kept, outcome
-from tests.moving_groups import PERIOD_S, moving_group
+from tests.moving_groups import PERIOD_S, joint_measurements, moving_group
 from tests.series import series
 from world.hardware.driver import Reading
 from world.hardware.measurements import InvalidReading, observation_frame
@@ -176,10 +174,10 @@ def test_an_anchor_with_three_ranges_from_one_line_is_not_said_to_stand_at_their
 def test_hypotheses_stay_those_of_their_robots_when_another_one_gets_its_first_range() -> None:
     """Then the indices of all robots change that come after it by name, and the origin may."""
     group = moving_group(3, 1, ticks=12)
-    known = {key for key, _ in group.facts.known}
-    late = {key for key in known if "r00" in (key.robot, key.other) or key.robot == "Mr00"}
-    facts = Facts(frozenset([one for one in group.facts.known if one[0] not in late]))
-    before, now = (joint_measurements(one, group.noise, PERIOD_S, 30.0) for one in (facts, group.facts))
+    early = [
+        one for one in group.facts if "r00" not in (one.key.robot, one.key.other) and one.key.robot != "Mr00"
+    ]
+    before, now = (joint_measurements(one, group.noise, PERIOD_S, 30.0) for one in (early, group.facts))
     assert (before.robots, now.robots) == (("r01", "r02"), ("r00", "r01", "r02"))
     assert before.origin != now.origin
     found = search(before)
