@@ -11,7 +11,7 @@ are identical to the bit. A planner is a subclass of `Planner`. Its instances ho
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -53,7 +53,7 @@ class Summary(msgspec.Struct, frozen=True):
     """The condition that still prevents a claim, for a user."""
     p_value: Probability | None = None
     """The smallest p-value of all consistency tests."""
-    unverified_anchors: Mapping[str, str] = {}
+    unverified_anchors: dict[str, str] = {}
     """The anchors of which no range tells whether they stand elsewhere than told, with the direction."""
 
 

@@ -193,7 +193,6 @@ class Robot:
             reports_lost=len(self.lost),
             frames_refused=frames_refused,
             bytes_sent=self.bytes_sent,
-            unverified_anchors=dict(summary.unverified_anchors),
         )
         if self._journal is not None:
             self._journal.write(self._encode(end), self._encode(final_report))
