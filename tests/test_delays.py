@@ -111,10 +111,11 @@ def is_wrong(row: PoseEstimateRow) -> bool:
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("noise", "wrong", "least"), [(None, 2, 105), ("uwb", 0, 85)])
+@pytest.mark.parametrize(("noise", "wrong", "least"), [(None, 2, 105), ("uwb", 0, 50)])
 def test_late_ranges_are_learned_and_hardly_a_claim_is_wrong(
     noise: str | None, wrong: int, least: int
 ) -> None:
+    """With `uwb`, the biases that radios may have leave half of the poses less accurate than 0.3 m."""
     found = estimate_of(read_ranges(LATE), noise)
     claims = [row for row in found.rows if row.claim]
     assert len(claims) >= least

@@ -137,8 +137,8 @@ def test_processes_decide_as_one_process_with_the_solver_of_the_example(tmp_path
 
 
 def test_a_recording_is_estimated_with_a_solver_as_with_the_smoother() -> None:
-    found = tandem.estimate(SAMPLE, noise="uwb-calibrated", solver=Smoother(), window=(0.0, 20.0))
-    expected = tandem.estimate(SAMPLE, noise="uwb-calibrated", window=(0.0, 20.0))
+    found = tandem.estimate(SAMPLE, noise="uwb-calibrated", solver=Smoother(), window=(0.0, 25.0))
+    expected = tandem.estimate(SAMPLE, noise="uwb-calibrated", window=(0.0, 25.0))
     assert {one: claim is not None for one, claim in claims(found).items()} == {"A": True, "B": True}
     last, again = (one.summary.robots["A"].final for one in (found, expected))
     assert last is not None

@@ -17,7 +17,9 @@ from msgspec.structs import replace
 from agent.estimation.elementary import eigh, product
 from agent.estimation.fit import Fit, Start, fits, with_told_priors
 from agent.estimation.gaussian.consistency import chi2_p_value
+from agent.estimation.gaussian.joint_claims import decisive_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.search import FEWEST_DECISIVE
 from protocol.motion import wrap
 
 PARTS = {2: "half", 3: "third"}
@@ -49,7 +51,7 @@ hardly known where the part tells little; where it tells as much as all others, 
 def fits_without_parts(fit: Fit, robot: int, measured: JointMeasurements) -> tuple[tuple[str, Fit], ...]:
     """Return the fits to what was `measured` without each part of a robot's ranges, by the name of the part.
 
-    They begin at `fit`.
+    They begin at `fit`. Parts without which the ranges do not locate the robot are not among them.
     """
     ranges, found = measured.ranges, []
     own = np.flatnonzero(ranges.of(robot))
@@ -60,6 +62,8 @@ def fits_without_parts(fit: Fit, robot: int, measured: JointMeasurements) -> tup
             left[order[part * count // parts : (part + 1) * count // parts]] = False
             start = Start(fit.start.poses, fit.start.errors, fit.weights[left])
             rest = replace(measured, ranges=ranges.rows(left), solver=None)
+            if decisive_ranges(robot, rest) < FEWEST_DECISIVE:
+                continue
             found += [(f"{ORDINALS[part]} {name}", one) for one in map(with_told_priors, fits(rest, [start]))]
     return tuple(found)
 
@@ -68,7 +72,10 @@ ORDINALS = ("first", "second", "third")
 
 
 def disagreement(fit: Fit, robot: int, measured: JointMeasurements) -> Disagreement:
-    """Return by how much the pose of a robot differs without one of the parts of the ranges, the worst."""
+    """Return by how much the pose of a robot differs without one of the parts of the ranges, the worst.
+
+    A fit without a part counts also if it has not converged: it moves away.
+    """
     own, worst, what = slice(3 * robot, 3 * robot + 3), 0.0, "without a part"
     for part, without in fits_without_parts(fit, robot, measured):
         away = without.poses[robot] - fit.poses[robot]
