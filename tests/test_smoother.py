@@ -14,10 +14,13 @@ from agent.estimation import gauss_newton, smoother
 from agent.estimation.fit import Start, fits
 from agent.estimation.gauss_newton import Convergence, Fitted, Point, point_at
 from agent.estimation.gaussian.joint_ranges import PosePrior
+from agent.estimation.gaussian.measured_rows import near_anchors
+from agent.estimation.gaussian.odometry_noise import track
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
 from agent.estimation.smoother import Measured, Singular, effect_of
 from protocol.motion import Pose, step
+from protocol.noise import Noise, VelocityNoise
 from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
 
 Array = smoother.Array
@@ -162,6 +165,27 @@ def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
         for name, one in found()._asdict().items():
             assert bits((one,)) == bits((getattr(expected, name),)), name
     assert kernel.guess(poses).tobytes() == gauss_newton.guess(of, poses).tobytes()
+
+
+def test_fits_with_the_sizes_of_missions_equal_their_text_to_the_bit() -> None:
+    noise = Noise(
+        anchor_sigma=0.1, mutual_sigma=0.1, outliers=0.05, odometry=VelocityNoise(0.01, 0.01, 0.0, 0.0)
+    )
+    turns = np.sin(np.arange(9.0))
+    paths = [track(np.full(9, 0.4), turn * turns, 1.0) for turn in (0.7, -0.9)]
+    own = [[(tick, 1.0 + 0.1 * tick + 0.05 * (tick % 3)) for tick in range(robot, 9)] for robot in (0, 1)]
+    pair = near_anchors(
+        paths, own, ((0.0, 0.0), (3.0, 0.0)), noise, 3.0, [(tick, 1.5) for tick in range(2, 10)]
+    )
+    for measured, sizes in ((pair, (2, 5, 3)), (pair.alone(1), (1, 3, 3))):
+        problem = Problem.of(measured)
+        of, by, kernel = problem.measured, problem.weighing, problem.kernel
+        assert (of.robots, of.common.shape[1], of.patterns.shape[1]) == sizes
+        poses, constant, white = np.arange(1.0, 1.0 + 3 * of.robots), *point_of(of, 3)[1:]
+        nothing = np.zeros(len(of.rho))
+        begun = point_at(of, poses, np.zeros(sizes[1]), constant, white, nothing, nothing)
+        expected = gauss_newton.fitted(of, by, begun, None, Convergence())
+        assert bits(kernel.fitted(poses, constant, white, None, Convergence())) == bits(expected)
 
 
 def test_the_effect_of_a_delay_is_the_derivative_of_the_ranges_by_it() -> None:

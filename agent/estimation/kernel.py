@@ -67,15 +67,17 @@ class Kernel:
             *(by.astray, by.astray_ratio, by.free, by.robust, by.noisy),
         )
         self._measured, self._weighing = ctypes.byref(measured), ctypes.byref(weighing)
-        ends = np.empty(2 * POINT + STEP + 4, np.intp)
+        ends = np.empty(2 * POINT_ARRAYS + STEP_ARRAYS + 4, np.intp)
         memory = map(address, (self._floats, self._numbers, ends))
         library().prepared(self._measured, self._weighing, *memory)
         self._ends = [0, *ends.tolist()]
         size, ticks = of.size, k * of.strays
         point = ((2, (n, m)), (3, (n, 2, k)), (WALK, (n, k + 1, 3)), (7, (n, k, 8)), (8, (count, 2)))
         step = ((2, (size, size)), (3, (n, 2, k)), (9, (3 * n, 3 * n)), (10, (n, ticks, 5)), (14, (n, ticks)))
-        of_points = [(i + begin, shape) for begin in (0, POINT) for i, shape in point]
-        self._shapes = dict[int, tuple[int, ...]](of_points + [(i + 2 * POINT, shape) for i, shape in step])
+        of_points = [(i + begin, shape) for begin in (0, POINT_ARRAYS) for i, shape in point]
+        self._shapes = dict[int, tuple[int, ...]](
+            of_points + [(i + 2 * POINT_ARRAYS, shape) for i, shape in step]
+        )
 
     def __reduce__(self) -> tuple[type[Kernel], tuple[Measured, Weighing]]:
         """Return how to build the kernel again from a copy, which has memory of its own."""
@@ -89,7 +91,7 @@ class Kernel:
 
     def step(self, walk: Walk, poses: Array, variance: Array, ridge: float, largest: float) -> FitStep:
         """Return a Gauss-Newton step; see `smoother.step`. Raises Singular."""
-        arrays, memory = self._part(2 * POINT, 2 * POINT + STEP)
+        arrays, memory = self._part(2 * POINT_ARRAYS, 2 * POINT_ARRAYS + STEP_ARRAYS)
         from_walk = np.concatenate([one.ravel() for one in walk])
         if not library().gauss_newton_step(
             *(self._measured, address(from_walk), address(poses), address(variance)),
@@ -138,17 +140,17 @@ class Kernel:
         last_step, level, inliers, outliers, model, final = memory[ends[-2] :].tolist()
         at = self._point(memory, int(model))
         after = at if final == model else self._point(memory, int(final))
-        *of_step, weights, variance, sound, _ = self._arrays(memory, 2 * POINT, len(ends) - 1)
+        *of_step, weights, variance, sound, _ = self._arrays(memory, 2 * POINT_ARRAYS, len(ends) - 1)
         of_fit = (weights, variance, sound, last_step, level, int(inliers), outliers)
         return Fitted(at, after, _step_of(of_step), *of_fit)
 
     def held(self, poses: Array, constant: Array, white: Array, weights: Array, steps: int) -> Fitted:
         """Return the fit in which a range holds a coordinate; see `gauss_newton.held`. Raises Singular."""
-        return self.fitted(poses, constant, white, weights, Convergence(steps, HELD))
+        return self.fitted(poses, constant, white, weights, Convergence(steps, HOLDING))
 
     def _point(self, memory: Array, number: int) -> Point:
         """Return the first or the second point of a fit."""
-        arrays = self._arrays(memory, number * POINT, (number + 1) * POINT)
+        arrays = self._arrays(memory, number * POINT_ARRAYS, (number + 1) * POINT_ARRAYS)
         *walk, own, prior_cost = arrays[WALK:]
         return Point._make([*arrays[:WALK], Walk._make(walk), own, float(prior_cost[0])])
 
@@ -170,13 +172,13 @@ class Kernel:
 WALK = 6
 """The place of the walk among the arrays of a point."""
 
-POINT = WALK + len(Walk._fields) + 2
+POINT_ARRAYS = WALK + len(Walk._fields) + 2
 """The number of arrays of a point."""
 
-STEP = FitStep._fields.index("shocks") + 2
+STEP_ARRAYS = FitStep._fields.index("shocks") + 2
 """The number of arrays of a step, of which the last one contains its numbers."""
 
-HELD = -1.0
+HOLDING = -1.0
 """The `Convergence.shortest` of a fit in which a range holds a coordinate."""
 
 
