@@ -294,7 +294,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         ranges = self.ranges
         if ranges.rho.max(initial=0.0) > reach:
             most = reach + IMPOSSIBLE * np.sqrt(np.square(ranges.sigma) + self.loosened)
-            ranges = ranges.rows(ranges.rho <= most)
+            ranges = ranges if (ranges.rho <= most).all() else ranges.rows(ranges.rho <= most)
         return msgspec.structs.replace(self, ranges=ranges, reach=reach).thinned_after()
 
     def thinned_after(self, tick: int = -1, most: int | None = None) -> JointMeasurements:
