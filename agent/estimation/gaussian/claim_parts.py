@@ -22,7 +22,7 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import FEWEST_DECISIVE
 from protocol.motion import wrap
 
-PARTS = {2: "half", 3: "third"}
+PART_NAMES = {2: "half", 3: "third"}
 """The numbers of parts, each with as many ranges, in the order of time, and their names.
 
 Halves alone overlook errors that reach from one into the other. Quarters and fifths found no more wrong
@@ -56,7 +56,7 @@ def fits_without_parts(fit: Fit, robot: int, measured: JointMeasurements) -> tup
     ranges, found = measured.ranges, []
     own = np.flatnonzero(ranges.of(robot))
     order, count = own[ranges.tick[own].argsort(kind="stable")], len(own)
-    for parts, name in PARTS.items():
+    for parts, name in PART_NAMES.items():
         for part in range(parts):
             left = np.ones(len(ranges.rho), bool)
             left[order[part * count // parts : (part + 1) * count // parts]] = False
