@@ -106,13 +106,15 @@ def _messages(observation: Observation, reports: list[Report], heard: set[tuple[
 
 
 def never(reached: set[str]) -> dict[str, list[str]]:
-    """Return the tasks, conditions and kinds of messages that are not among `reached`."""
+    """Return the tasks, conditions and kinds of messages of missions that are not among `reached`."""
     named = {one.partition("/")[0] for one in reached}
     conditions = {one.partition("withheld: ")[2] for one in reached}
     messages = {one.rpartition(": ")[2] for one in reached}
     return {
         "tasks": sorted(task_names() - named),
-        "conditions": [one.name for one in claim.CONDITIONS if one.name not in conditions],
+        "conditions": [
+            one.name for one in claim.CONDITIONS if one.users - ON_RECORDINGS and one.name not in conditions
+        ],
         "messages": [one for one in MESSAGES if one not in messages],
     }
 
@@ -126,6 +128,9 @@ def task_names() -> set[str]:
         names |= {name} if isinstance(name := vars(kind).get("name"), str) else set()
     return names
 
+
+ON_RECORDINGS = frozenset({"recording"})
+"""The users of the conditions that concern no mission."""
 
 OUTCOMES = ("localised", "undecided", "inconsistent")
 """The names of the task of a robot with a result."""
