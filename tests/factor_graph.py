@@ -35,6 +35,7 @@ class Optimum(NamedTuple):
     covariance: Array
     error: float
     """Half the sum of squared residuals."""
+    values: gtsam.Values
 
 
 def pose_of(robot: int, tick: int) -> int:
@@ -85,6 +86,11 @@ def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Seque
             break
     else:
         raise AssertionError("gtsam has found no optimum")
+    return optimum_at(graph, values, last)
+
+
+def optimum_at(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Sequence[int]) -> Optimum:
+    """Return the optimum if it is at `values`, with the covariance of `graph` there."""
     local = gtsam.Marginals(graph, values).jointMarginalCovariance(last).fullMatrix()
     mean, turn = np.empty(6), np.zeros((6, 6))
     for robot, key in enumerate(last):  # gtsam's covariance is in the frame of the robot
@@ -92,7 +98,7 @@ def optimum(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, last: Seque
         mean[i : i + 3] = pose.x(), pose.y(), pose.theta()
         turn[i : i + 2, i : i + 2] = pose.rotation().matrix()
         turn[i + 2, i + 2] = 1.0
-    return Optimum(mean, turn @ local @ turn.T, graph.error(values))
+    return Optimum(mean, turn @ local @ turn.T, graph.error(values), values)
 
 
 def nudged(fit: Fit, apart: tuple[float, float], draw: np.random.Generator) -> list[Pose]:
