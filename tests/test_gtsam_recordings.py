@@ -216,7 +216,7 @@ def test_both_recorded_poses_are_gtsams_within_a_hundredth_of_a_sigma(window: Co
 
 
 def test_the_covariance_of_both_recorded_poses_is_gtsams_within_a_hundredth(window: Compared) -> None:
-    """The noise level multiplies the part of white errors: the derivative by the logarithm of their variance."""
+    """The noise level multiplies the part of white errors: the derivative by the log of their variance."""
     assert window.ours.level < 1.0
     white = (window.more - window.theirs.covariance) / (MORE - 1.0)
     theirs = window.theirs.covariance - (1.0 - window.ours.level) * white
