@@ -192,7 +192,7 @@ class Compared(NamedTuple):
     ours: Fit
     theirs: Optimum
     more: Array
-    """Its covariance if the variances of white errors are MORE times as large."""
+    """The covariance of theirs if the variances of white errors are MORE times as large."""
 
 
 @pytest.fixture(scope="module", params=range(WINDOWS))

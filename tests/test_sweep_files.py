@@ -154,7 +154,7 @@ MISTAKES = {
         JOINT.replace("n.period", "n.perod"): "axis[0].fields[0]: 'mission.perod': mission has no",
     },
 }
-"""What is replaced in BOTH, by what, and what is then said."""
+"""The text of BOTH that is replaced, its replacement, and the error that follows."""
 
 
 @pytest.mark.parametrize(("was", "new"), [(was, new) for was in MISTAKES for new in MISTAKES[was]])

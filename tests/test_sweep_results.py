@@ -1,4 +1,4 @@
-"""What a sweep leaves and says: its folder, its summary, its audits and its commands."""
+"""The output of a sweep: its folder, its summary, its audits and its commands."""
 
 from __future__ import annotations
 
