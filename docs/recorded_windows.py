@@ -136,13 +136,13 @@ def row_of(series: Series, results: Sequence[WindowResult]) -> str:
     """Return one line of the table."""
     poses = [row for one in results for row in one.rows]
     claims = [row for row in poses if row.claim]
-    wrong = {" ".join(one.robots): sum(is_wrong(row) for row in one.rows if row.claim) for one in results}
+    wrong = [" ".join(one.robots) for one in results if any(row.claim and is_wrong(row) for row in one.rows)]
     firsts = [one.first_claim_s for one in results if math.isfinite(one.first_claim_s)]
     cells = (
         *(series.name, series.noise or "stated", f"{series.accuracy:g}", len(results), len(firsts)),
         f"{np.median(firsts):.1f}" if firsts else "-",
         *(len(claims), sum(is_wrong(row) for row in claims)),
-        ", ".join([robots for robots, count in wrong.items() if count]) or "-",
+        ", ".join(dict.fromkeys(wrong)) or "-",
         *(_held(claims), len(poses), _held(poses)),
         f"{np.median([row.position_error_m for row in poses]):.2f}" if poses else "-",
         f"{sum(one.cpu_s for one in results):.0f}",

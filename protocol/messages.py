@@ -101,6 +101,8 @@ MAX_REPORT_RUNS = 70
 MAX_REPORT_RANGES = 70
 """The maximum number of ranges in a Report, for the same reason."""
 
+MOST_UNVERIFIED = 100
+"""The most anchors that a FinalReport says no range tells about; it has to fit into a frame."""
 MAX_MEMBERS = 1000
 """The maximum number of robots of a group."""
 
@@ -787,12 +789,14 @@ class FinalReport(Message, frozen=True):
     """The number of refused frames of all kinds."""
     bytes_sent: Count
     """The total size of the Reports sent, in bytes."""
-    unverified_anchors: Annotated[dict[RobotId, Text], Meta(max_length=MAX_MEMBERS)] = {}
+    unverified_anchors: Annotated[dict[RobotId, Text], Meta(max_length=MOST_UNVERIFIED)] = {}
     """The anchors of a team of which no range tells whether they stand as far off as `accuracy`, with the
     direction: across the line of the only two, for instance. Empty for others, and before a claim."""
 
     def __post_init__(self) -> None:
         _cut(self, "blocking_reason")
+        cut = {name: text[:MAX_TEXT] for name, text in [*self.unverified_anchors.items()][:MOST_UNVERIFIED]}
+        force_setattr(self, "unverified_anchors", cut)
 
 
 # --- to viewers, and between drivers ---

@@ -71,7 +71,7 @@ class Condition(NamedTuple):
     users: frozenset[User]
     """The users whom it concerns."""
     last: bool
-    """True if it is asked once all others hold: after a search of the whole plane, and a test of anchors."""
+    """True if it is asked only when all others hold, after a search of the plane and a test of anchors."""
     blocks: Callable[[Judged], str]
     """Return why the condition is not met; an empty text if it is.
 

@@ -286,10 +286,10 @@ LARGER = 1e-3
 
 @lru_cache(maxsize=8)
 def with_told_priors(fit: Fit) -> Fit:
-    """Return `fit` with the covariance that it has if a noise level below 1 is one of white errors only.
+    """Return `fit` with a covariance of which a noise level below 1 multiplies only the part of white errors.
 
-    Small residuals tell that ranges and odometry are repeated accurately. They do not tell that biases and
-    slow errors are smaller than their priors. With a gain K and white variances R, the part of these is
+    Small residuals show that white errors are small, not that biases and slow errors are smaller than their
+    priors. With a gain K and white variances R, the part of these is
     K R K', which is the derivative of the covariance by the logarithm of R.
     """
     if not fit.level < 1.0:
@@ -299,7 +299,7 @@ def with_told_priors(fit: Fit) -> Fit:
     try:
         ends = larger.step(walk, poses, (1.0 + LARGER) * variance, RIDGE, math.inf).ends
     except Singular:
-        return fit
+        return fit._replace(covariance=step.ends)
     return fit._replace(covariance=step.ends - (1.0 - fit.level) / LARGER * (ends - step.ends))
 
 

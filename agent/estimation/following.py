@@ -90,7 +90,7 @@ class Following(NamedTuple):
     tested: int = 0
     """The number of ranges at that test."""
     doubted: int = 0
-    """The number of ranges since which all tests have found such an anchor; 0 if the latest has not."""
+    """The number of ranges at the first of the latest tests that all found one; 0 if the last one did not."""
     disagreed: Mapping[str, int] = {}
     """The number of ticks after which parts of the ranges have disagreed last, of each robot."""
     begun_again: int = 0

@@ -5,7 +5,7 @@ They end a command with STOPPED_STATUS. One with an inbox receives them as items
 
 from __future__ import annotations
 
-import datetime  # noqa: F401  # msgspec drops the error of a signal while it imports it, and crashes later
+import datetime  # noqa: F401  # msgspec would drop the error of a signal during this import, and crash later
 import os
 import signal
 import sys

@@ -87,7 +87,8 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
 def _unverified(anchors: Sequence[str]) -> str:
     """Return the sentence on the anchors of which no range tells whether they stand elsewhere than told."""
     named = listed(anchors, MOST_NAMED_ROBOTS, "more anchors")
-    return f"no range tells whether {named} stand elsewhere than told; summary.json has the directions"
+    stand = "stand" if len(anchors) > 1 else "stands"
+    return f"no range tells whether {named} {stand} elsewhere than told; summary.json has the directions"
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:

@@ -42,8 +42,8 @@ class Disagreement(NamedTuple):
 MOST_KNOWN = 0.5
 """The largest fraction of a variance without a part that counts as known with it, too.
 
-The covariance of the difference of two poses, with and without a part, is the difference of theirs. It is
-hardly known where the part tells little; where it tells as much as all others, this is exact.
+The covariance of the difference of two poses, with and without a part, is the difference of theirs. That
+is uncertain if the part tells little, so at most this share of a variance is subtracted.
 """
 
 

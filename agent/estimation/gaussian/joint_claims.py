@@ -38,7 +38,7 @@ class Displacement(NamedTuple):
     def what(self) -> str:
         """The words for it."""
         away = f"by its ranges, {math.hypot(*self.vector):.2g} m from its position ({self.sigmas:.1f} sigmas)"
-        return f"{away}, or {' or '.join(self.others)} does" if self.others else away
+        return f"{away}; instead, it may be {' or '.join(self.others)}" if self.others else away
 
     def unverified(self, displaced: float) -> str:
         """Return a sentence if `displaced` m in that direction are less than DISPLACED_SIGMAS; else none."""

@@ -65,9 +65,9 @@ Two circles have two intersections, so a few ranges from different places leave 
 find. With outliers it takes SEED_RANGES."""
 
 OFF_IMAGE = 0.3
-"""The RMS of its ranges, as a fraction of the longest one, beyond which an image is none of a hypothesis.
+"""The RMS residual of an image, as a fraction of the longest range, above which no fit begins there.
 
-Robots that have turned have none; a fit from there takes all its steps, and mostly leads back.
+Images of robots that have turned do not fit: such a fit takes all its steps, and mostly leads back.
 """
 
 COARSE_STILL = 0.05
@@ -246,9 +246,8 @@ def _with_images(found: tuple[Hypothesis, ...], part: JointMeasurements) -> tupl
             poses[others] = np.stack(
                 (c * x + s * y + 2.0 * foot[0], s * x - c * y + 2.0 * foot[1], 2.0 * course - heading), 1
             )
-            starts += (
-                [Start(poses)] if _off(poses, part) <= OFF_IMAGE * float(np.max(part.ranges.rho)) else []
-            )
+            if _off(poses, part) <= OFF_IMAGE * float(np.max(part.ranges.rho)):
+                starts.append(Start(poses))
     return _with_more(found, starts, part)
 
 
