@@ -245,6 +245,8 @@ def parts(judged: Judged) -> str:
 
     Each difference has a p-value of at least {CLAIM_P_VALUE:g}.
     """
+    if not judged.compares:
+        return ""
     found = disagreement(judged.fit, judged.robot, judged.measured)
     return "" if found.p_value >= CLAIM_P_VALUE else f"parts of the ranges disagree: {found.what}"
 

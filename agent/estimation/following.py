@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Container, Mapping
 from typing import NamedTuple
 
-from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, parts, strays
+from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, parts, parts_before, strays
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, displacements
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -93,6 +93,8 @@ class Following(NamedTuple):
     """The number of ranges at the first of the latest tests that all found one; 0 if the last one did not."""
     disagreed: Mapping[str, int] = {}
     """The number of ticks after which parts of the ranges have disagreed last, of each robot."""
+    compared: Mapping[str, int] = {}
+    """The number of ticks at the latest comparison of parts, of each robot."""
     begun_again: int = 0
     """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
 
@@ -119,7 +121,9 @@ class Following(NamedTuple):
             now = now._replace(reasons={**now.reasons, **dict.fromkeys(sorted(claiming), GIVEN_UP)})
         elif due or claiming:
             found = ended(search(used, now.known), used)
-            now = now._replace(known=found, searched=count, searches=self.searches + 1)
+            now = now._replace(
+                known=found, searched=count, searches=self.searches + 1, compared=self.compared
+            )
             now = now._tested(used, rule, user, asked)
         return now._replace(claimed=self.claimed | now._claiming)
 
@@ -160,7 +164,9 @@ class Following(NamedTuple):
         part = used.some(found.located)
         judged = {
             part.robots[i]: of_joint(
-                user, i, found, certainty, part, *rule, self.disagreed.get(part.robots[i], 0)
+                *(user, i, found, certainty, part, *rule),
+                self.disagreed.get(part.robots[i], 0),
+                self.compared.get(part.robots[i], 0),
             )
             for i, certainty in enumerate(certainties(found))
             if part.robots[i] in asked and not part.is_anchor(i)
@@ -181,6 +187,11 @@ class Following(NamedTuple):
         disagreed = {
             name: judged[name].passed for name, one in reasons.items() if one and one.condition is parts
         }
+        compared = {
+            name: judged[name].passed
+            for name, one in reasons.items()
+            if (one is None or one.condition in (parts, parts_before)) and judged[name].compares
+        }
         return self._replace(
             part=part,
             judged=judged,
@@ -189,4 +200,5 @@ class Following(NamedTuple):
             tested=tested,
             doubted=doubted,
             disagreed={**self.disagreed, **disagreed},
+            compared={**self.compared, **compared},
         )

@@ -71,6 +71,13 @@ def sufficient_mutual_ranges(noise: Noise) -> int:
     return MUTUAL_RANGES_WITH_OUTLIERS if noise.outliers else MUTUAL_RANGES
 
 
+RECOMPARED = 1.1
+"""The factor by which the time must have grown before parts of a robot's ranges are compared again.
+
+Each comparison takes five joint fits. With less, estimates of many robots take a multiple of the time.
+"""
+
+
 class Judged(NamedTuple):
     """The estimate of a robot's pose, as the conditions for its claim see it."""
 
@@ -105,11 +112,18 @@ class Judged(NamedTuple):
     """The anchor that seems to stand elsewhere than it was surveyed, if one does."""
     disagreed: int = 0
     """The number of ticks after which parts of the ranges have disagreed last."""
+    compared: int = 0
+    """The number of ticks at the latest comparison of parts of the ranges."""
 
     @property
     def passed(self) -> int:
         """The number of ticks so far."""
         return max([len(path.v) for path in self.measured.paths])
+
+    @property
+    def compares(self) -> bool:
+        """True if parts of the ranges are to be compared now."""
+        return self.passed >= RECOMPARED * self.compared
 
     @property
     def rival(self) -> Rival:
@@ -175,6 +189,7 @@ def of_joint(
     accuracy: float,
     confidence: float,
     disagreed: int = 0,
+    compared: int = 0,
 ) -> Judged:
     """Return the estimate of the robot with the index `robot` among those that the fits `found` have.
 
@@ -199,4 +214,5 @@ def of_joint(
         confidence=confidence,
         rivals_of=(robot,),
         disagreed=disagreed,
+        compared=compared,
     )
