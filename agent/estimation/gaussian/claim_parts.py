@@ -8,7 +8,6 @@ Each part is left out in turn: a fit to one part alone would have few ranges.
 from __future__ import annotations
 
 import math
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -47,7 +46,6 @@ is uncertain if the part tells little, so at most this share of a variance is su
 """
 
 
-@lru_cache(maxsize=2)
 def fits_without_parts(fit: Fit, robot: int, measured: JointMeasurements) -> tuple[tuple[str, Fit], ...]:
     """Return the fits to what was `measured` without each part of a robot's ranges, by the name of the part.
 
