@@ -78,7 +78,8 @@ typedef struct {
    and then the weights and the noise of the ticks. */
 typedef struct {
     double *innovation, *variance, *effects, *gain, *state, *u, *p, *information, *gradient;
-    double *told, *by_unknowns, *weight, *weighted, *effect, *lower, *inner, *vector, *other;
+    double *misfit, *of_limited, *told, *told_limited, *by_unknowns, *weight, *weighted, *effect;
+    double *lower, *whitening, *inner, *vector, *other;
     double *updated, *errors, *spread, *ratios, *shorter, *sound, *noise;
 } Work;
 
@@ -179,14 +180,16 @@ SIZED void solved(const double *lower, Index size, const double *right, double *
     }
 }
 
-/* The inverse by `solved` for all columns at once. */
-SIZED void inverted(const double *lower, Index size, double *row, double *inverse)
+/* The transposed inverse of `lower`, and the inverse by `solved`, for all columns at once. */
+SIZED void inverted(const double *lower, Index size, double *row, double *whitening, double *inverse)
 {
     memset(inverse, 0, sizeof(double) * size * size);
+    memset(whitening, 0, sizeof(double) * size * size);
     for (Index a = 0; a < size; a++) {
         memset(row, 0, sizeof(double) * size);
-        for (Index e = 0; e < a; e++) add(row, lower[a * size + e], inverse + e * size, size);
-        for (Index c = 0; c < size; c++) inverse[a * size + c] = ((c == a) - row[c]) / lower[a * size + a];
+        for (Index e = 0; e < a; e++) add(row, lower[a * size + e], inverse + e * size, e + 1);
+        for (Index c = 0; c <= a; c++) inverse[a * size + c] = ((c == a) - row[c]) / lower[a * size + a];
+        for (Index c = 0; c <= a; c++) whitening[c * size + a] = inverse[a * size + c];
     }
     for (Index a = size - 1; a >= 0; a--) {
         for (Index c = 0; c < size; c++) row[c] = -(inverse[a * size + c] /= lower[a * size + a]);
@@ -194,6 +197,12 @@ SIZED void inverted(const double *lower, Index size, double *row, double *invers
     }
     for (Index a = 0; a < size; a++)
         for (Index e = 0; e < a; e++) inverse[a * size + e] = inverse[e * size + a];
+}
+
+SIZED void whitened(const double *whitening, Index size, const double *vector, double *found)
+{
+    memset(found, 0, sizeof(double) * size);
+    for (Index e = 0; e < size; e++) add(found, vector[e], whitening + e * size, size);
 }
 
 /* --- sizes ------------------------------------------------------------------------------------------ */
@@ -482,14 +491,19 @@ SIZED int limited(const Measured *of, double largest, const double *change, Work
     return 1;
 }
 
+/* What remains of the innovations after a change. */
+SIZED void misfits(const Measured *of, const double *change, const Work *w, double *found)
+{
+    const Index q = unknowns(of), size = estimated(of);
+    for (Index j = 0; j < of->ranges; j++)
+        found[j] = w->innovation[j] - dot(w->effects + j * q, change, size);
+}
+
 SIZED double chi2_of(const Measured *of, const double *poses, const double *change, Work *w)
 {
-    const Index n3 = 3 * of->robots, q = unknowns(of), size = estimated(of);
+    const Index n3 = 3 * of->robots, size = estimated(of);
     double chi2 = 0.0, by[3][3], *off = w->vector;
-    for (Index j = 0; j < of->ranges; j++) {
-        const double misfit = w->innovation[j] - dot(w->effects + j * q, change, size);
-        chi2 += misfit * misfit / w->variance[j];
-    }
+    for (Index j = 0; j < of->ranges; j++) chi2 += w->misfit[j] * w->misfit[j] / w->variance[j];
     chi2 += dot(change + n3, change + n3, size - n3);
     for (Index i = 0; i < n3; i += 3) {
         basis_of(of, poses, i / 3, by);
@@ -499,11 +513,12 @@ SIZED double chi2_of(const Measured *of, const double *poses, const double *chan
     return chi2;
 }
 
-SIZED double told_by(const Measured *of, const Walk *walk, Index j, Work *w, double *precision)
+SIZED void told_by(const Measured *of, const Walk *walk, Index j, Work *w, Step *to)
 {
     const Index s = states(of), q = unknowns(of), size = estimated(of);
     const double *gain = w->gain + j * s, spread = w->variance[j];
-    const double here = w->innovation[j] / spread - dot(gain, w->told, s);
+    to->multipliers[j] = w->misfit[j] / spread - dot(gain, w->told, s);
+    to->own[j] = w->of_limited[j] / spread - dot(gain, w->told_limited, s);
     double *effect = w->effect, *weighted = w->weighted;
     for (Index e = 0; e < size; e++) effect[e] = w->effects[j * q + e] / spread;
     for (Index a = 0; a < s; a++) add(effect, -gain[a], w->by_unknowns + a * size, size);
@@ -511,20 +526,20 @@ SIZED double told_by(const Measured *of, const Walk *walk, Index j, Work *w, dou
     for (Index e = 0; e < s; e++)
         if (gain[e] != 0.0)
             for (Index a = 0; a < s; a++) weighted[a] += w->weight[a * s + e] * gain[e];
-    *precision = 1.0 / spread + dot(gain, weighted, s);
+    to->alone[j] = 1.0 / spread + dot(gain, weighted, s);
     const Row row = row_of(of, walk, j);
     for (int t = 0; t < row.count; t++) {
         const Index a = row.at[t];
         const double h = row.by[t];
-        w->told[a] += h * here;
+        w->told[a] += h * to->multipliers[j];
+        w->told_limited[a] += h * to->own[j];
         add(w->by_unknowns + a * size, h, effect, size);
         add(w->weight + a * s, -h, weighted, s);
         for (Index e = 0; e < s; e++) w->weight[e * s + a] -= h * weighted[e];
     }
     for (int t = 0; t < row.count; t++)
         for (int f = 0; f < row.count; f++)
-            w->weight[row.at[t] * s + row.at[f]] += row.by[t] * row.by[f] * *precision;
-    return here;
+            w->weight[row.at[t] * s + row.at[f]] += row.by[t] * row.by[f] * to->alone[j];
 }
 
 SIZED void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Work *w, Step *to)
@@ -534,13 +549,13 @@ SIZED void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Work
     const double effects[2][3] = {{move[0], move[1], 0.0}, {move[4], move[5], of->period}};
     double *by[2] = {w->vector, w->other}, *shock = to->shocks + 5 * (i * of->ticks + k);
     for (Index e = 0; e < 2; e++) {
-        double slope = 0.0;
-        memset(by[e], 0, sizeof(double) * size);
+        shock[e] = 0.0;
+        memset(w->effect, 0, sizeof(double) * size);
         for (Index a = 0; a < 2 + e; a++) {
-            slope += effects[e][a] * w->told[x + a];
-            add(by[e], effects[e][a], w->by_unknowns + (x + a) * size, size);
+            shock[e] += effects[e][a] * w->told[x + a];
+            add(w->effect, effects[e][a], w->by_unknowns + (x + a) * size, size);
         }
-        shock[e] = slope - dot(by[e], to->change, size);
+        whitened(w->whitening, size, w->effect, by[e]);
     }
     for (Index t = 0; t < 3; t++) {
         const Index e = t / 2, f = (t + 1) / 2;
@@ -548,9 +563,7 @@ SIZED void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Work
         for (Index a = 0; a < 2 + e; a++)
             for (Index b = 0; b < 2 + f; b++)
                 information += effects[e][a] * effects[f][b] * w->weight[(x + a) * s + x + b];
-        for (Index a = 0; a < size; a++)
-            information -= by[e][a] * dot(to->inverse + a * size, by[f], size);
-        shock[2 + t] = information;
+        shock[2 + t] = information - dot(by[e], by[f], size);
     }
 }
 
@@ -559,14 +572,12 @@ SIZED void attributed(const Measured *of, const Walk *walk, Index i, Index k, Wo
     const Index s = states(of), size = estimated(of), K = of->ticks, x = 3 * i, y = 3 * i + 1, h = 3 * i + 2;
     const double *move = walk->moves + 8 * (i * K + k);
     const double sx = move[0], sy = move[1], dx = move[2], dy = move[3], gx = move[4], gy = move[5];
-    double *told = w->told, *by = w->by_unknowns, *weight = w->weight;
-    const double of_x = told[x] - dot(by + x * size, to->limited, size);
-    const double of_y = told[y] - dot(by + y * size, to->limited, size);
-    const double of_h = told[h] - dot(by + h * size, to->limited, size);
+    double *told = w->told, *limited = w->told_limited, *by = w->by_unknowns, *weight = w->weight;
     const Index v = 2 * i * K + k, omega = (2 * i + 1) * K + k;
-    to->white[v] = of->white[v] * (sx * of_x + sy * of_y);
-    to->white[omega] = of->white[omega] * (gx * of_x + gy * of_y + of->period * of_h);
+    to->white[v] = of->white[v] * (sx * limited[x] + sy * limited[y]);
+    to->white[omega] = of->white[omega] * (gx * limited[x] + gy * limited[y] + of->period * limited[h]);
     told[h] += -dy * told[x] + dx * told[y];
+    limited[h] += -dy * limited[x] + dx * limited[y];
     add(by + h * size, -dy, by + x * size, size);
     add(by + h * size, dx, by + y * size, size);
     add(weight + h * s, -dy, weight + x * s, s);
@@ -581,16 +592,14 @@ SIZED void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
 {
     const Index s = states(of), size = estimated(of);
     memset(w->told, 0, sizeof(double) * s);
+    memset(w->told_limited, 0, sizeof(double) * s);
     memset(w->by_unknowns, 0, sizeof(double) * s * size);
     memset(w->weight, 0, sizeof(double) * s * s);
     for (Index k = of->ticks; k >= 0; k--) {
         for (Index j = of->begin[k + 1] - 1; j >= of->begin[k]; j--) {
-            const double here = told_by(of, walk, j, w, to->alone + j);
-            to->multipliers[j] = here - dot(w->effect, to->change, size);
-            to->own[j] = here - dot(w->effect, to->limited, size);
-            memset(w->vector, 0, sizeof(double) * size);
-            for (Index a = 0; a < size; a++) add(w->vector, w->effect[a], to->inverse + a * size, size);
-            to->explained[j] = dot(w->effect, w->vector, size);
+            told_by(of, walk, j, w, to);
+            whitened(w->whitening, size, w->effect, w->vector);
+            to->explained[j] = dot(w->vector, w->vector, size);
         }
         if (k == 0) break;
         for (Index i = 0; i < of->robots; i++) {
@@ -599,6 +608,7 @@ SIZED void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
         }
         for (Index a = 3 * of->robots; a < s; a++) {
             w->told[a] *= of->decay;
+            w->told_limited[a] *= of->decay;
             scale(w->by_unknowns + a * size, of->decay, size);
             scale(w->weight + a * s, of->decay, s);
             for (Index e = 0; e < s; e++) w->weight[e * s + a] *= of->decay;
@@ -634,13 +644,11 @@ SIZED void slow_errors(const Measured *of, Work *w, Step *to)
 SIZED void ends_of(const Measured *of, Work *w, Step *to)
 {
     const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of), size = estimated(of);
-    double *spread = w->vector, *effect = w->other;
-    for (Index a = 0; a < n3; a++) {
-        memcpy(to->ends + a * n3, w->p + a * s, sizeof(double) * n3);
-        memset(spread, 0, sizeof(double) * size);
-        for (Index e = 0; e < size; e++) add(spread, w->u[a * q + e], to->inverse + e * size, size);
-        for (Index e = 0; e < n3; e++) to->ends[a * n3 + e] += dot(spread, w->u + e * q, size);
-    }
+    double *spread = w->vector, *effect = w->other, *by = w->by_unknowns;
+    for (Index a = 0; a < n3; a++) whitened(w->whitening, size, w->u + a * q, by + a * size);
+    for (Index a = 0; a < n3; a++)
+        for (Index e = 0; e < n3; e++)
+            to->ends[a * n3 + e] = w->p[a * s + e] + dot(by + a * size, by + e * size, size);
     for (Index c = size; c < q; c++) {
         solved(w->lower, size, w->information + c * q, spread);
         for (Index a = 0; a < n3; a++) effect[a] = w->u[a * q + c] - dot(w->u + a * q, spread, size);
@@ -660,13 +668,15 @@ SIZED int sized_step(
     }
     if (!cholesky(w->information, q, 0, size, w->lower)) return 0;
     solved(w->lower, size, w->gradient, to->change);
-    inverted(w->lower, size, w->vector, to->inverse);
+    inverted(w->lower, size, w->vector, w->whitening, to->inverse);
     if (!cholesky(to->inverse, size, 0, n3, w->inner)) return 0;
     substituted(w->inner, n3, to->change, w->vector);
     const double length = sqrt(dot(w->vector, w->vector, n3));
     double of_start = 0.0;
     for (Index a = 0; a < n3; a++) of_start += 2.0 * log(w->inner[a * n3 + a]);
     if (!limited(of, largest, to->change, w, to->limited)) return 0;
+    misfits(of, to->change, w, w->misfit);
+    misfits(of, to->limited, w, w->of_limited);
     backward(of, walk, w, to);
     double volume = 0.0;
     for (Index j = 0; j < of->ranges; j++) volume += log(w->variance[j]);
@@ -1162,8 +1172,8 @@ static double *workspace(const Measured *of, Work *to)
     const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of), size = estimated(of), N = of->ranges;
     const Index longest = q > of->radios ? q : of->radios, ticks = of->strays * of->robots * of->ticks;
     const Index sizes[] = {
-        N, N, N * q, N * s, s, s * q, s * s, q * q, q, s, s * size, s * s, s, size, size * size, size * size,
-        longest, longest, N, N, N, N, n3, ticks, 2 * ticks};
+        N, N, N * q, N * s, s, s * q, s * s, q * q, q, N, N, s, s, s * size, s * s, s, size,
+        size * size, size * size, size * size, longest, longest, N, N, N, N, n3, ticks, 2 * ticks};
     const int count = sizeof sizes / sizeof *sizes;
     Index all = 0;
     for (int i = 0; i < count; i++) all += sizes[i];

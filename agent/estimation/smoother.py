@@ -434,11 +434,12 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
         information[a][a] += ridge + ridge * information[a][a]
     lower = cholesky(information, 0, size)
     change = solved(lower, passed.gradient[:size])
-    inverse = inverted(lower)
+    inverse, whitening = inverted(lower), whitening_of(lower)
     inner = cholesky(inverse, 0, n3)
-    whitened = substituted(inner, change[:n3])
+    in_sigmas = substituted(inner, change[:n3])
     limited = _limited(passed, change, n3, largest)
-    white, own, multipliers, alone, explained, shocks = _backward(of, walk, passed, inverse, change, limited)
+    misfits = [_misfits(passed, one) for one in (change, limited)]
+    white, own, multipliers, alone, explained, shocks = _backward(of, walk, passed, whitening, *misfits)
     volume = 0.0
     for one in passed.variance:
         volume += math.log(one)
@@ -457,10 +458,10 @@ def step(of: Measured, walk: Walk, poses: Array, variance: Array, ridge: float, 
         np.array(multipliers),
         np.array(alone),
         np.array(explained),
-        np.array(_ends(of, passed, lower, inverse)),
+        np.array(_ends(of, passed, lower, whitening)),
         np.array(shocks).reshape(of.robots, of.ticks * of.strays, 5),
-        _chi2(of, passed, poses, change),
-        math.sqrt(dot(whitened, whitened)),
+        _chi2(of, passed, poses, change, misfits[0]),
+        math.sqrt(dot(in_sigmas, in_sigmas)),
         volume,
         of_start,
     )
@@ -478,12 +479,17 @@ def _limited(passed: Passed, change: Vector, n3: int, largest: float) -> Vector:
     return poses + solved(cholesky(passed.information, n3, len(change)), left)
 
 
-def _chi2(of: Measured, passed: Passed, poses: Array, change: Vector) -> float:
+def _misfits(passed: Passed, change: Vector) -> Vector:
+    """Return what remains of the innovations after a `change` of the unknowns, in m."""
+    pairs = zip(passed.innovation, passed.effects, strict=True)
+    return [innovation - dot(effect, change) for innovation, effect in pairs]
+
+
+def _chi2(of: Measured, passed: Passed, poses: Array, change: Vector, misfits: Vector) -> float:
     """Return the least sum of squares, of all errors in their sigmas."""
     n3, chi2 = 3 * of.robots, 0.0
-    for j, effect in enumerate(passed.effects):
-        misfit = passed.innovation[j] - dot(effect[: of.size], change)
-        chi2 += misfit * misfit / passed.variance[j]
+    for misfit, variance in zip(misfits, passed.variance, strict=True):
+        chi2 += misfit * misfit / variance
     chi2 += dot(change[n3:], change[n3:])
     off = []
     for i in range(of.robots):
@@ -495,28 +501,33 @@ def _chi2(of: Measured, passed: Passed, poses: Array, change: Vector) -> float:
 
 
 def _backward(
-    of: Measured, walk: Walk, passed: Passed, inverse: Matrix, change: Vector, limited: Vector
+    of: Measured, walk: Walk, passed: Passed, whitening: Matrix, misfits: Vector, of_limited: Vector
 ) -> tuple[list[Matrix], Vector, Vector, Vector, Vector, list[Matrix]]:
-    """Return the white errors, the vectors own, multipliers, alone and explained, and shocks of a step."""
-    s, size, count = len(passed.p), of.size, len(of.rho)
-    told = Told([0.0] * s, zeros(s, size), zeros(s, s))
+    """Return the white errors, the vectors own, multipliers, alone and explained, and shocks of a step.
+
+    `misfits` remain after the whole step, and those `of_limited` after the limited one.
+    """
+    s, count = len(passed.p), len(of.rho)
+    told = Told([0.0] * s, [0.0] * s, zeros(s, of.size), zeros(s, s))
     white = [zeros(2, of.ticks) for _ in range(of.robots)]
     own, multipliers, alone, explained = ([0.0] * count for _ in range(4))
     shocks = [zeros(of.ticks * of.strays, 5) for _ in range(of.robots)]
     for k in range(of.ticks, -1, -1):
         for j in range(of.begin[k + 1] - 1, of.begin[k] - 1, -1):
-            here, effect, alone[j] = _told_by(of, walk, passed, j, told)
-            multipliers[j] = here - dot(effect, change)
-            own[j] = here - dot(effect, limited)
-            for a in range(size):
-                explained[j] += effect[a] * dot(inverse[a], effect)
+            gain, spread = passed.gain[j], passed.variance[j]
+            multipliers[j] = misfits[j] / spread - dot(gain, told.vector)
+            own[j] = of_limited[j] / spread - dot(gain, told.limited)
+            effect, alone[j] = _told_by(of, walk, passed, j, told, multipliers[j], own[j])
+            in_sigmas = whitened(whitening, effect)
+            explained[j] = dot(in_sigmas, in_sigmas)
         if k > 0:
             for i in range(of.robots):
                 if of.strays:
-                    shocks[i][k - 1] = _shock(of, walk, i, k - 1, told, inverse, change)
-                _attributed(of, walk, i, k - 1, told, limited, white[i])
+                    shocks[i][k - 1] = _shock(of, walk, i, k - 1, told, whitening)
+                _attributed(of, walk, i, k - 1, told, white[i])
             for a in range(3 * of.robots, s):
                 told.vector[a] *= of.decay
+                told.limited[a] *= of.decay
                 scale(told.by_unknowns[a], of.decay)
                 scale(told.weight[a], of.decay)
                 for row in told.weight:
@@ -525,21 +536,27 @@ def _backward(
 
 
 class Told(NamedTuple):
-    """The information of later ranges about the state: a vector, how the unknowns change it, and a matrix."""
+    """The information of later ranges about the state."""
 
     vector: Vector
+    """the derivative of the log-likelihood by the state, after the whole step; shape (s,)"""
+    limited: Vector
+    """that after the limited step; shape (s,)"""
     by_unknowns: Matrix
+    """how the unknowns change it; shape (s, p)"""
     weight: Matrix
+    """the information; shape (s, s)"""
 
 
-def _told_by(of: Measured, walk: Walk, passed: Passed, j: int, told: Told) -> tuple[float, Vector, float]:
+def _told_by(
+    of: Measured, walk: Walk, passed: Passed, j: int, told: Told, multiplier: float, own: float
+) -> tuple[Vector, float]:
     """Add what range `j` tells.
 
-    Return its innovation and the effects of the unknowns on it, both multiplied by the inverse covariance of
-    all ranges, and the diagonal of that.
+    Return the effects of the unknowns on it, multiplied by the inverse covariance of all ranges, and the
+    diagonal of that.
     """
     gain, spread = passed.gain[j], passed.variance[j]
-    here = passed.innovation[j] / spread - dot(gain, told.vector)
     effect = [one / spread for one in passed.effects[j][: of.size]]
     for a in range(len(gain)):
         add(effect, -gain[a], told.by_unknowns[a])
@@ -547,7 +564,8 @@ def _told_by(of: Measured, walk: Walk, passed: Passed, j: int, told: Told) -> tu
     precision = 1.0 / spread + dot(gain, weighted)
     row = _row(of, walk, j)
     for a, h in row:
-        told.vector[a] += h * here
+        told.vector[a] += h * multiplier
+        told.limited[a] += h * own
         add(told.by_unknowns[a], h, effect)
         add(told.weight[a], -h, weighted)
         for e in range(len(gain)):
@@ -555,41 +573,40 @@ def _told_by(of: Measured, walk: Walk, passed: Passed, j: int, told: Told) -> tu
     for a, h in row:
         for e, other in row:
             told.weight[a][e] += h * other * precision
-    return here, effect, precision
+    return effect, precision
 
 
-def _shock(of: Measured, walk: Walk, i: int, k: int, told: Told, inverse: Matrix, change: Vector) -> Vector:
+def _shock(of: Measured, walk: Walk, i: int, k: int, told: Told, whitening: Matrix) -> Vector:
     """Return the row of `shocks` of robot `i` in tick `k`, by what is told of the state after it."""
     sx, sy, _, _, gx, gy, _, _ = walk.moves[i, k]
     effects = ((sx, sy), (gx, gy, of.period))
     shock: Vector = []
-    by_unknowns = zeros(2, of.size)
+    by_unknowns: Matrix = []
     for e in range(2):
-        slope = 0.0
+        slope, by = 0.0, [0.0] * of.size
         for a, h in enumerate(effects[e], 3 * i):
             slope += h * told.vector[a]
-            add(by_unknowns[e], h, told.by_unknowns[a])
-        shock.append(slope - dot(by_unknowns[e], change))
+            add(by, h, told.by_unknowns[a])
+        shock.append(slope)
+        by_unknowns.append(whitened(whitening, by))
     for e, f in ((0, 0), (0, 1), (1, 1)):
         information = 0.0
         for a, h in enumerate(effects[e], 3 * i):
             for b, g in enumerate(effects[f], 3 * i):
                 information += h * g * told.weight[a][b]
-        for a in range(of.size):
-            information -= by_unknowns[e][a] * dot(inverse[a], by_unknowns[f])
-        shock.append(information)
+        shock.append(information - dot(by_unknowns[e], by_unknowns[f]))
     return shock
 
 
-def _attributed(of: Measured, walk: Walk, i: int, k: int, told: Told, limited: Vector, white: Matrix) -> None:
+def _attributed(of: Measured, walk: Walk, i: int, k: int, told: Told, white: Matrix) -> None:
     """Set the `white` errors of robot `i` in tick `k`, and move what is told to the state before it."""
     sx, sy, dx, dy, gx, gy, _, _ = walk.moves[i, k]
     x, y, h = 3 * i, 3 * i + 1, 3 * i + 2
-    vector, by_unknowns, weight = told
-    of_x, of_y, of_h = (vector[a] - dot(by_unknowns[a], limited) for a in (x, y, h))
-    white[0][k] = of.white[i, 0, k] * (sx * of_x + sy * of_y)
-    white[1][k] = of.white[i, 1, k] * (gx * of_x + gy * of_y + of.period * of_h)
+    vector, limited, by_unknowns, weight = told
+    white[0][k] = of.white[i, 0, k] * (sx * limited[x] + sy * limited[y])
+    white[1][k] = of.white[i, 1, k] * (gx * limited[x] + gy * limited[y] + of.period * limited[h])
     vector[h] += -dy * vector[x] + dx * vector[y]
+    limited[h] += -dy * limited[x] + dx * limited[y]
     add(by_unknowns[h], -dy, by_unknowns[x])
     add(by_unknowns[h], dx, by_unknowns[y])
     add(weight[h], -dy, weight[x])
@@ -619,17 +636,12 @@ def _slow_errors(of: Measured, own: Vector) -> Vector:
     return found
 
 
-def _ends(of: Measured, passed: Passed, lower: Matrix, inverse: Matrix) -> Matrix:
+def _ends(of: Measured, passed: Passed, lower: Matrix, whitening: Matrix) -> Matrix:
     """Return the covariance of the last poses, with that of the surveying errors that are considered."""
     n3, size = 3 * of.robots, of.size
     u = [row[:size] for row in passed.u[:n3]]
-    ends = [row[:n3] for row in passed.p[:n3]]
-    for a in range(n3):
-        spread = [0.0] * size
-        for e in range(size):
-            add(spread, u[a][e], inverse[e])
-        for e in range(n3):
-            ends[a][e] += dot(spread, u[e])
+    by = [whitened(whitening, row) for row in u]
+    ends = [[passed.p[a][e] + dot(by[a], by[e]) for e in range(n3)] for a in range(n3)]
     for c in range(size, size + 2 * of.anchors):
         by_error = solved(lower, passed.information[c][:size])
         effect = [passed.u[a][c] - dot(u[a], by_error) for a in range(n3)]
@@ -695,6 +707,20 @@ def solved(lower: Matrix, right: Vector) -> Vector:
     for a in range(len(lower) - 1, -1, -1):
         found[a] /= lower[a][a]
         add(found, -found[a], lower[a][:a])
+    return found
+
+
+def whitening_of(lower: Matrix) -> Matrix:
+    """Return the transposed inverse of `lower`."""
+    size = len(lower)
+    return [substituted(lower, [1.0 if a == e else 0.0 for a in range(size)]) for e in range(size)]
+
+
+def whitened(whitening: Matrix, vector: Vector) -> Vector:
+    """Return the inverse of a triangular factor times a vector; `whitening` is that inverse, transposed."""
+    found = [0.0] * len(vector)
+    for factor, row in zip(vector, whitening, strict=True):
+        add(found, factor, row)
     return found
 
 
