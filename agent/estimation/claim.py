@@ -35,6 +35,9 @@ bound delays one of a hundred right claims by a few ticks.
 LARGEST_STRAY_SHARE = 0.15
 """The largest fraction of ranges that may be strays, in addition to the outliers that were told."""
 
+EARLY_SIGMAS = 3.0
+"""The least delay of ranges, in standard deviations below 0, which says that the odometry is late."""
+
 NORMAL_RATIO = -0.5 * WRONG_SIGMAS**2
 """The log-likelihood ratio of a rival where the likelihood is normal."""
 
@@ -134,6 +137,18 @@ def strays(judged: Judged) -> str:
     total, count = len(own), int(np.count_nonzero(own <= INLIER))
     most = (LARGEST_STRAY_SHARE + judged.measured.noise.outliers) * total
     return "" if count <= most else f"{count} of {total} ranges fit no other"
+
+
+@condition("recording")
+def odometry_on_time(judged: Judged) -> str:
+    """The learned delay of ranges is not {EARLY_SIGMAS:g} sigmas or more below 0.
+
+    No range is measured after its stamp: then the odometry is late, and so are all poses.
+    """
+    delay, sigma = judged.fit.delay
+    if delay >= -EARLY_SIGMAS * sigma:
+        return ""
+    return f"its odometry seems to be {-delay:.2g} s late, or its antenna to be further ahead than told"
 
 
 @condition(*EVERYBODY)
@@ -268,6 +283,7 @@ CONDITIONS = (
     convergence,
     consistency,
     strays,
+    odometry_on_time,
     definite_covariance,
     determined_position,
     position,

@@ -117,6 +117,12 @@ class Fit(NamedTuple):
         return np.sqrt(np.maximum(np.diagonal(self.linear.step.inverse)[self.start.poses.size :], 0.0))
 
     @property
+    def delay(self) -> tuple[float, float]:
+        """The delay (s) of all ranges after the odometry, and its standard deviation; 0 without a prior."""
+        column, prior = self.problem.measured.delayed, self.problem.noise.priors.range_delay
+        return prior * float(self.constants[column]), prior * float(self.constant_sigmas[column])
+
+    @property
     def ticks(self) -> Places:
         """The tick of each range; shape (N,)."""
         return self.problem.ticks
