@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from agent.estimation.gaussian.inference import PlanningHypothesis
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.planning.assured import Assured
 from agent.planning.exchange import LogPlanner
 from agent.planning.paper import Paper

@@ -20,9 +20,9 @@ from typing import Any
 import numpy as np
 
 from agent.estimation import exact_estimator
-from agent.estimation.gaussian import inference
+from agent.estimation.gaussian import planning_hypotheses
 from agent.peer import peer_state
-from agent.planning import accuracy_seeking
+from agent.planning import phase3_survey
 from agent.process import node
 from compose.recording import run
 from compose.scenario import group_meetings
@@ -131,10 +131,10 @@ def bound() -> None:
 def clock() -> None:
     """A retreat begins at the time of the clock, not at the tick."""
     edited(
-        accuracy_seeking,
-        "_continue_phase3",
-        "0.0 - command.omega), state.tick))",
-        "0.0 - command.omega), __import__('time').monotonic_ns() % 1000))",
+        phase3_survey,
+        "sensed",
+        "Retreating(back, state.tick)",
+        "Retreating(back, __import__('time').monotonic_ns() % 1000)",
     )
 
 
@@ -156,7 +156,7 @@ def case() -> None:
 
 def triangle() -> None:
     """The lower triangle of a covariance is read in the place of the upper one."""
-    inference.TRIANGLE = np.tril_indices(3)
+    planning_hypotheses.TRIANGLE = np.tril_indices(3)
 
 
 MUTANTS: dict[Callable[[], None], str] = {

@@ -16,7 +16,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation import judged, posterior
-from agent.estimation.gaussian import inference, search
+from agent.estimation.gaussian import mission_measurements, search
 from agent.estimation.gaussian.range_weights import Weighing
 from agent.planning import phase3_last_manoeuvre
 from compose.scenario import group_meetings
@@ -41,7 +41,7 @@ def sigma() -> None:
         found = before(*given, **named)
         return replace(found, ranges=replace(found.ranges, sigma=0.8 * found.ranges.sigma))
 
-    wrapped(inference, "near_anchors", scaled)
+    wrapped(mission_measurements, "near_anchors", scaled)
 
 
 def confidence() -> None:

@@ -10,8 +10,8 @@ import pytest
 from msgspec.structs import replace
 
 from agent.estimation.claim import CONDITIONS, Blocked, blocked, claim
+from agent.estimation.gaussian import pair
 from agent.estimation.judged import Judged, User
-from agent.planning import pair_claim
 from compose.launch.in_process import run_mission
 from protocol.messages import Localised
 from tests.surveys import SIGMA, scenario_of
@@ -28,7 +28,7 @@ def judged() -> Judged:
         return claim(one)
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pair_claim, "claim", remembered)
+        patch.setattr(pair, "claim", remembered)
         run_mission(scenario_of(SIGMA, 4))
     return seen[-1]
 

@@ -8,12 +8,15 @@ from typing import Any
 import pytest
 
 import tandem
-from agent.estimation.gaussian import claim_rivals
-from agent.planning import accuracy_seeking, active_sensing, pair_claim
+from agent.estimation.claim import Blocked, claim
+from agent.estimation.claim import rivals as no_rivals
+from agent.estimation.gaussian import claim_rivals, pair
+from agent.estimation.judged import Judged
+from agent.planning import active_sensing
 from agent.planning.assured import Assured
-from agent.planning.state import RobotState
 from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
+from protocol.messages import Localised
 from tests.groups import random_group
 from tests.series import series
 from tests.surveys import SIGMA, assert_localised, scenario_of
@@ -48,17 +51,17 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
 ) -> None:
     rivals, planned = [], []
 
-    def with_claim(*args: Any) -> tuple[RobotState, claim_rivals.Rival | None]:
-        state, rival = pair_claim.with_claim(*args)
-        if rival is not None:
-            rivals.append(rival)
-        return state, rival
+    def remembered(judged: Judged) -> Localised | Blocked:
+        found = claim(judged)
+        if isinstance(found, Blocked) and found.condition is no_rivals:
+            rivals.append(judged.rival)
+        return found
 
     def plan_together(hypotheses: Any, *args: Any) -> Any:
         planned.append(hypotheses)
         return active_sensing.plan_together(hypotheses, *args)
 
-    monkeypatch.setattr(accuracy_seeking, "with_claim", with_claim)
+    monkeypatch.setattr(pair, "claim", remembered)
     monkeypatch.setattr(Assured, "joint_manoeuvres", lambda _, *args: plan_together(*args))
     assert_localised(run_mission(scenario_of(SIGMA, 382, reach=1.5)))
     assert rivals

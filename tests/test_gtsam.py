@@ -16,8 +16,9 @@ import numpy as np
 import pytest
 from msgspec.structs import astuple, replace
 
-from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.mission_measurements import pair_of
+from agent.estimation.gaussian.planning_hypotheses import localised, planning_hypothesis, to_second_order
 from agent.estimation.gaussian.search import search
 from agent.estimation.posterior import Hypothesis
 from agent.planning.assured import Assured
@@ -239,7 +240,7 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
     folder = tmp_path_factory.mktemp("recorded")
     recorded(request.param, folder)
     state, claimed = remembered(folder, "a")
-    pair = inference.pair_of(state)
+    pair = pair_of(state)
     ours = search(pair).hypotheses[0]
     robots = [measured(folder, robot) for robot in ("a", "b")]
     assert [len(seen.odometry) for seen in robots] == [state.tick] * 2, "both claim in the same tick"
@@ -253,10 +254,10 @@ def mission(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFac
 
 
 def test_the_claim_came_of_this_fit(mission: Compared) -> None:
-    (held,) = inference.pair_planning_hypotheses([mission.ours])
+    held = planning_hypothesis(mission.ours)
     anchor = mission.config.anchor
-    stated = inference.to_second_order(held, m2(mission.pair))
-    ours, covariance = astuple(inference.localised(stated, 0, (anchor.x, anchor.y)))
+    stated = to_second_order(held, m2(mission.pair))
+    ours, covariance = astuple(localised(stated, 0, (anchor.x, anchor.y)))
     assert mission.claimed.covariance is not None
     off = np.array(astuple(mission.claimed.pose)) - np.array(astuple(ours))
     sigmas = (covariance.position_sigma, covariance.position_sigma, covariance.heading_sigma)

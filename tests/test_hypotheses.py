@@ -19,7 +19,7 @@ from agent.estimation.closed_forms import Placement, same_placement
 from agent.estimation.compiled import address, library
 from agent.estimation.fit import fits
 from agent.estimation.gauss_newton import Convergence, Fitted
-from agent.estimation.gaussian import claim_rivals, evidence, inference, placement_guesses
+from agent.estimation.gaussian import claim_rivals, evidence, placement_guesses
 from agent.estimation.gaussian import search as searching
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import FINISHED, consistency_test
@@ -35,6 +35,7 @@ from agent.estimation.gaussian.joint_ranges import (
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.placement_guesses import _encounter, placements
+from agent.estimation.gaussian.planning_hypotheses import planning_hypothesis
 from agent.estimation.gaussian.search import _until_now, of_anchor, search, starts_about
 from agent.estimation.kernel import Kernel
 from agent.estimation.posterior import NO_HYPOTHESES, Hypothesis, Posterior, follow
@@ -540,7 +541,7 @@ def test_numbers_beyond_floats_block_a_claim(monkeypatch: pytest.MonkeyPatch) ->
         return held(self, *begun)
 
     monkeypatch.setattr(Kernel, "held", held_after_steps)
-    (claimed,) = inference.pair_planning_hypotheses([first])
+    claimed = planning_hypothesis(first)
     rival = claim_rivals.likeliest_rival(first.fit, pair, claimed, (0, 1))
     assert rival.log_likelihood_ratio == math.inf
     monkeypatch.setattr(evidence, "fits", lambda *_: [])

@@ -15,7 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.inference import beginning, path_of
+from agent.estimation.gaussian.mission_measurements import beginning, path_of
 from agent.estimation.gaussian.odometry_noise import variances
 from agent.estimation.knowledge import Belief, Knowledge
 from agent.peer.motion_log import MotionLog

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 import tandem
-from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array, Track, track
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.planning.active_sensing import STALLED, plan_alone, plan_together
 from agent.planning.strides import PLANS, choice, is_stalled, stride
 from compose.launch.in_process import run_mission

@@ -11,14 +11,14 @@ import pytest
 from msgspec.structs import replace
 
 import tandem
+from agent.estimation.gaussian import pair
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Belief
 from agent.estimation.posterior import Posterior
-from agent.planning import pair_claim
-from agent.planning.accuracy_seeking import OFF_RADIUS
 from agent.planning.assured import Assured
 from agent.planning.phase2_orbit import orientation
+from agent.planning.phase2_pursuit import OFF_RADIUS
 from agent.planning.state import RobotState
 from agent.planning.tasks import Aligning, Radial
 from compose.launch.in_process import run_mission
@@ -351,12 +351,12 @@ def test_a_robot_that_left_its_peers_range_does_not_go_there_again() -> None:
 def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.MonkeyPatch) -> None:
     ticks = len(survey(SIGMA, SHORT).ticks)
 
-    def searched(pair: JointMeasurements, known: Posterior) -> Posterior:
-        found = search(pair, known)
+    def searched(measured: JointMeasurements, known: Posterior) -> Posterior:
+        found = search(measured, known)
         still = [one._replace(fit=one.fit._replace(last_step=0.5)) for one in found.hypotheses]
         return found._replace(hypotheses=tuple(still))
 
-    monkeypatch.setattr(pair_claim, "search", searched)
+    monkeypatch.setattr(pair, "search", searched)
     recording = run_mission(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
     assert summary(recording, "in-process", None)["outcome"] == "undecided"
     assert all(

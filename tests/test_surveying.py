@@ -12,8 +12,8 @@ from msgspec.structs import replace
 
 from agent.estimation.exact_estimator import EXACT_ESTIMATOR
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
-from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.odometry_noise import Array
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.planning.active_sensing import plan_alone, plan_together
 from agent.planning.drive import homing, pursuit
 from agent.planning.strides import STRIDES_AHEAD, choice, stride

@@ -1,8 +1,8 @@
 """The estimator contract: hypotheses about the poses of one robot or of both, from its measurements.
 
 `exact_estimator` and `gaussian.gaussian_estimator` implement it. Planners do not ask which of the two they
-have: the mission's noise selects it, in `planning.state`. Only `planning.accuracy_seeking`, the steps of
-`assured` under noise, plans with covariances, and takes them from `gaussian.inference`.
+have: the mission's noise selects it, in `planning.state`. Only the steps of `assured` under noise plan with
+covariances, and take them from `gaussian.own_anchor` and `gaussian.pair`.
 """
 
 from __future__ import annotations
@@ -11,30 +11,24 @@ from typing import NamedTuple, Protocol
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import Branch, PairObservation
-from agent.estimation.knowledge import Belief, Knowledge
+from agent.estimation.knowledge import Belief, Knowledge, OwnAnchor
 from protocol.messages import Observation, Verdict
-from protocol.motion import Pose
+from protocol.motion import ORIGIN, Pose
 
 
 class AnchorEstimate(NamedTuple):
     """The result of the ranges of a robot to its anchor."""
 
-    belief: Belief
+    known: OwnAnchor
     branches: tuple[Branch, ...]
     """The branches that a further range has to distinguish, the most probable first."""
-    best: Branch | None
-    """The most probable branch; None if there is none, or if several are equally probable."""
     margin: float
     """The distance in m inside R at which a point is certainly in range."""
-
-
-class FittedBranch(NamedTuple):
-    """A branch, fitted to all ranges that determine it."""
-
-    branch: Branch
-    anchor_error: float
-    """The bound in m on the error of the anchor's position; 0 if the belief has its covariance instead."""
-    enough: bool
+    best: Branch | None = None
+    """The most probable branch, fitted to all ranges; None if there is none, or several are as probable."""
+    anchor_error: float = 0.0
+    """The bound in m on the error of the anchor's position; 0 if the hypotheses have it instead."""
+    enough: bool = True
     """True if further ranges would not make a claim possible that is impossible now."""
 
 
@@ -46,16 +40,16 @@ class PairEstimate(NamedTuple):
     """The verdict that follows from the estimate; None if it depends on further ranges."""
     placements: tuple[Placement, ...]
     """The possible placements of the frame in which `a` is given in that of `b`, likeliest first."""
-    a: Pose
-    """The pose of a; in <a(M1)>, or the origin of a frame of its own."""
-    b: Pose
-    """The pose of b; in <b(M2)>, or the origin of a frame of its own."""
-    checked: bool
-    """True if a redundant mutual range has confirmed the placements."""
-    observations: tuple[PairObservation, ...]
-    """The ticks from which the placements follow; empty if the belief has their covariance instead."""
     failure: str
     """The reason for the verdict Undecided if no further mutual range is measured."""
+    a: Pose = ORIGIN
+    """The pose of a; in <a(M1)>, or the origin of a frame of its own."""
+    b: Pose = ORIGIN
+    """The pose of b; in <b(M2)>, or the origin of a frame of its own."""
+    checked: bool = False
+    """True if a redundant mutual range has confirmed the placements."""
+    observations: tuple[PairObservation, ...] = ()
+    """The ticks from which the placements follow; empty if the belief has their covariance instead."""
 
 
 class Estimator(Protocol):
@@ -79,8 +73,8 @@ class Estimator(Protocol):
     def is_informative(self, knowledge: Knowledge, observation: Observation) -> bool:
         """Return whether the anchor range of `observation` adds to what the robot knows."""
 
-    def on_anchor(self, knowledge: Knowledge, rho0: float) -> FittedBranch | None:
-        """Return the branch of a robot that starts on its anchor; None if `rho0` (m) does not say so."""
+    def on_anchor(self, knowledge: Knowledge, rho0: float) -> AnchorEstimate | None:
+        """Return the estimate of a robot that starts on its anchor; None if `rho0` (m) does not say so."""
 
     def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
         """Return the branches that the anchor ranges allow.
@@ -88,9 +82,6 @@ class Estimator(Protocol):
         `candidates` contains the branches that the ranges before the last one allowed; it is empty at the
         second range.
         """
-
-    def fitted(self, knowledge: Knowledge, branch: Branch) -> FittedBranch:
-        """Return `branch` as it is at the end of phase 1."""
 
     def pair(self, knowledge: Knowledge, first_tick: int, *, second_range: bool) -> PairEstimate | None:
         """Return the hypotheses about both poses; None if the measurements do not suffice yet.

@@ -9,7 +9,7 @@ import msgspec
 from msgspec.structs import replace
 
 from agent.estimation import precision
-from agent.estimation.estimator import AnchorEstimate, Estimator, FittedBranch, PairEstimate
+from agent.estimation.estimator import AnchorEstimate, Estimator, PairEstimate
 from agent.estimation.exact import Branch, PairObservation, branches, weigh_branches, weigh_placements
 from agent.estimation.knowledge import Belief, Knowledge, off_anchor
 from agent.estimation.mutual_ranges import base, redundant, solve
@@ -34,36 +34,35 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         It is dropped from the end of phase 1 on.
         """
         return not (
-            knowledge.belief.branch is not None
+            knowledge.own_anchor.branch is not None
             and observation.executed == REST
             and observation.anchor_range == knowledge.log.ranges[-1].range
         )
 
-    def on_anchor(self, knowledge: Knowledge, rho0: float) -> FittedBranch | None:
-        """Return the branch of a robot on its anchor: its heading is radial by definition."""
+    def on_anchor(self, knowledge: Knowledge, rho0: float) -> AnchorEstimate | None:
+        """Return the estimate of a robot on its anchor: its heading is radial by definition."""
         if rho0 > SAME_ANCHORS * precision.range_rounding(knowledge, knowledge.log, knowledge.tick):
             return None
         accuracy = precision.anchor(knowledge, ORIGIN, knowledge.log)
-        return FittedBranch(Branch(0.0, ORIGIN), accuracy.error, accuracy.enough)
+        branch = Branch(0.0, ORIGIN)
+        return AnchorEstimate(knowledge.own_anchor, (branch,), 0.0, branch, accuracy.error, accuracy.enough)
 
     def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
         """Return the branches +alpha and -alpha of eq. (2) that agree with every tick of phase 1."""
-        belief = knowledge.belief
+        known = knowledge.own_anchor
         if not candidates:
             ranges = knowledge.log.ranges
             candidates = branches(ranges[0].range, knowledge.odometry, ranges[-1].range)
-            belief = replace(belief, possible=candidates)
+            known = replace(known, possible=candidates)
         mission = knowledge.config.mission
         floor = precision.range_rounding(knowledge, knowledge.log, knowledge.tick)
         margin = precision.margin(mission, floor)
         remaining = weigh_branches(candidates, knowledge.seen(), mission.sensing_range, floor, margin)
         remaining = precision.merged(knowledge, remaining)
-        return AnchorEstimate(belief, remaining, remaining[0] if len(remaining) == 1 else None, margin)
-
-    def fitted(self, knowledge: Knowledge, branch: Branch) -> FittedBranch:
-        """Return `branch` fitted to the ranges with the smallest anchor error."""
-        branch, accuracy = precision.fitted(knowledge, branch)
-        return FittedBranch(branch, accuracy.error, accuracy.enough)
+        if len(remaining) != 1:
+            return AnchorEstimate(known, remaining, margin)
+        best, accuracy = precision.fitted(knowledge, remaining[0])
+        return AnchorEstimate(known, remaining, margin, best, accuracy.error, accuracy.enough)
 
     def pair(self, knowledge: Knowledge, first_tick: int, *, second_range: bool) -> PairEstimate | None:
         """Return the placements of eq. (7) that agree with every tick from `first_tick` on.
@@ -80,10 +79,12 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         pair_base = base(away_from_m2, odometry_rounding)
         if pair_base is None:
             return None
-        belief = knowledge.belief
-        if belief.peer_anchor is None:
-            belief = replace(belief, peer_anchor=precision.peer_anchor(knowledge))
-        error_bound = precision.combined_error(belief, odometry_rounding)
+        belief, peers = knowledge.belief, knowledge.belief.peer_anchor
+        if peers is None:
+            peers = precision.peer_anchor(knowledge)
+            belief = replace(belief, peer_anchor=peers)
+        anchor_errors = knowledge.own_anchor.error + peers
+        error_bound = anchor_errors + odometry_rounding
         belief = _with_placements(knowledge, belief, observations, pair_base, error_bound)
         remaining = belief.placements
         checked = redundant(ranged, pair_base)
@@ -93,20 +94,12 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         elif (
             checked
             and len(remaining) == 1
-            and precision.pinned_down(knowledge, belief, remaining[0], ranged, error_bound)
+            and precision.pinned_down(knowledge, remaining[0], ranged, anchor_errors, error_bound)
         ):
             verdict = Localised(knowledge.world_pose(remaining[0]))
         failure = "does not select a placement" if checked else "could not be measured: b left a's range"
-        return PairEstimate(
-            belief,
-            verdict,
-            remaining,
-            observations[-1].a,
-            observations[-1].b,
-            checked,
-            observations,
-            f"the third mutual range {failure}",
-        )
+        latest, failure = observations[-1], f"the third mutual range {failure}"
+        return PairEstimate(belief, verdict, remaining, failure, latest.a, latest.b, checked, observations)
 
 
 def _with_placements(

@@ -8,15 +8,15 @@ from typing import Literal, NamedTuple, get_args
 from agent.estimation.fit import Fit, with_told_priors
 from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
 from agent.estimation.gaussian.consistency import HIGHEST_LEVEL, chi2_p_value, consistency_test
-from agent.estimation.gaussian.inference import (
-    PlanningHypothesis,
-    localised,
-    m2_of,
-    pair_planning_hypotheses,
-    to_second_order,
-)
 from agent.estimation.gaussian.joint_claims import Displacement, decisive_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.mission_measurements import m2_of
+from agent.estimation.gaussian.planning_hypotheses import (
+    PlanningHypothesis,
+    localised,
+    planning_hypothesis,
+    to_second_order,
+)
 from agent.estimation.posterior import Certainty, Hypothesis, Posterior
 from protocol.messages import Inconsistent, Localised, RobotConfig
 from protocol.mission import HEADING_ACCURACY
@@ -152,7 +152,6 @@ def of_pair(
     required = required_mutual_ranges(mission.noise) if user in FIRST_CLAIMS else 0
     own_heading = config.heading_accuracy if places < ENOUGH_FOR_HEADING else HEADING_ACCURACY
     best = scored[0]
-    (first,) = pair_planning_hypotheses(scored[:1])
     return Judged(
         user=user,
         robot=robot,
@@ -162,7 +161,7 @@ def of_pair(
         hypotheses=len(scored),
         ranges=places,
         required=required,
-        stated=to_second_order(first, m2_of(config)),
+        stated=to_second_order(planning_hypothesis(best), m2_of(config)),
         inconsistency=consistency_test(best.fit, pair, robot) if places >= required else None,
         accuracy=mission.accuracy,
         headings=tuple([(i, f"{ids[i]}'s", own_heading if i == robot else HEADING_ACCURACY) for i in (0, 1)]),

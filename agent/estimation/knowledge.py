@@ -18,19 +18,33 @@ from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse
 from protocol.orbits import Orbit
 
 
+class OwnAnchor(msgspec.Struct, frozen=True):
+    """The results of phase 1: the pose relative to the own anchor. They hold in all meetings."""
+
+    branch: Branch | None = None
+    """The branch selected at the end of phase 1. With noisy sensors, the most probable branch so far."""
+    kind: messages.BranchKind | None = None
+    """The observation that decided the branch."""
+    done_tick: int | None = None
+    """The tick in which phase 1 ended for the first time."""
+    possible: tuple[Branch, ...] = ()
+    """Exact sensors: the branches that the first two anchor ranges allow."""
+    error: float = 0.0
+    """Exact sensors: the bound in m on the error of the anchor's position, from the ranges of phase 1."""
+    hypotheses: tuple[Hypothesis, ...] = ()
+    """Noisy sensors: the hypotheses about the position of the anchor, the most probable first."""
+    branches: tuple[Branch, ...] = ()
+    """The branch that corresponds to each of them."""
+    ranges_at_last_fit: int = 0
+    """Noisy sensors: the number of anchor ranges at their latest fit."""
+
+
 class Belief(msgspec.Struct, frozen=True):
-    """The results of phases 1 and 3: hypotheses, counts and the reasons for and against a claim.
+    """The results of phase 3, in one meeting: hypotheses, counts and the reasons for and against a claim.
 
     Fields marked "exact sensors" or "noisy sensors" are set only in that case.
     """
 
-    possible: tuple[Branch, ...] = ()
-    """Exact sensors: the branches that the first two anchor ranges allow."""
-    branch: Branch | None = None
-    """The branch selected at the end of phase 1. With noisy sensors, the most probable branch so far."""
-    branch_kind: messages.BranchKind | None = None
-    phase1_done_tick: int | None = None
-    """The tick in which phase 1 ended for the first time."""
     encounter_tick: int | None = None
     """The tick in which phase 3 began."""
     placements: tuple[Placement, ...] = ()
@@ -41,18 +55,10 @@ class Belief(msgspec.Struct, frozen=True):
     Exact sensors: the solutions of eq. (7), and those that agree with the ticks without detection. Noisy
     sensors: the hypotheses of the first search, and the present ones.
     """
-    own_anchor: float = 0.0
-    """Exact sensors: the bound in m on the error of the own anchor's position, from the ranges of phase 1."""
     peer_anchor: float | None = None
-    """Exact sensors: the same bound in m for the peer and its anchor."""
+    """Exact sensors: the bound in m on the error of the peer's anchor, as `OwnAnchor.error`."""
     observations: tuple[PairObservation, ...] = ()
     """Exact sensors: the ticks from which the placements follow."""
-    own: tuple[Hypothesis, ...] = ()
-    """Noisy sensors: the hypotheses about the position of the own anchor, the most probable first."""
-    branches: tuple[Branch, ...] = ()
-    """The branch that corresponds to each hypothesis in `own`."""
-    ranges_at_last_fit: int = 0
-    """Noisy sensors: the number of anchor ranges at the latest fit of `own`."""
     pair: tuple[Hypothesis, ...] = ()
     """Noisy sensors: the hypotheses about both robots' poses in <W>, the most probable first."""
     poses: tuple[Pose, ...] = ()
@@ -64,7 +70,7 @@ class Belief(msgspec.Struct, frozen=True):
     blocking_reason: str | None = None
     """Noisy sensors: the condition that still prevents a claim; None if every condition is met."""
     beginning: int = 0
-    """Noisy sensors: the tick from which on the measurements of a count in `pair` (`inference.beginning`)."""
+    """Noisy sensors: the tick from which on the measurements of a count in `pair` (see `beginning`)."""
     ranges_at_last_search: int = 0
     """Noisy sensors: the number of mutual ranges at the latest search of the whole plane for hypotheses."""
     inconsistency: Inconsistent | None = None
@@ -82,7 +88,7 @@ class Belief(msgspec.Struct, frozen=True):
 
 
 class Knowledge(msgspec.Struct, frozen=True):
-    """The measurements and the reports that a robot has, and its belief. An `Estimator` works on it."""
+    """The measurements and the reports that a robot has, and its beliefs. An `Estimator` works on it."""
 
     config: RobotConfig
     tick: int = -1
@@ -90,6 +96,7 @@ class Knowledge(msgspec.Struct, frozen=True):
     """The current pose in the frame of the pose at tick 0, by dead reckoning."""
     log: MotionLog = MotionLog()
     mutual: tuple[Ranged, ...] = ()
+    own_anchor: OwnAnchor = OwnAnchor()
     belief: Belief = Belief()
     peer_state: PeerState = PeerState()
     solver: Solver | None = None
@@ -103,8 +110,8 @@ class Knowledge(msgspec.Struct, frozen=True):
     @property
     def start(self) -> Pose:
         """Return the pose of tick 0 in the frame of the robot's anchor; known from phase 2 on."""
-        assert self.belief.branch is not None
-        return self.belief.branch.start
+        assert self.own_anchor.branch is not None
+        return self.own_anchor.branch.start
 
     @property
     def local_pose(self) -> Pose:

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import FITTED, Branch, PairObservation, anchor_error, polished, turn_error
-from agent.estimation.knowledge import Belief, Knowledge
+from agent.estimation.knowledge import Knowledge
 from agent.peer.motion_log import MotionLog
 from protocol.mission import RANGE_MARGIN, Mission
 from protocol.motion import ORIGIN, Pose, Segment, follow
@@ -142,26 +142,17 @@ def odometry_rounding(knowledge: Knowledge, tick: int) -> float:
     )
 
 
-def combined_error(belief: Belief, rounding_error: float) -> float:
-    """Return the bound in m on both anchor errors and both odometries' rounding errors.
-
-    `rounding_error` is `odometry_rounding`.
-    """
-    own, peers = belief.own_anchor, belief.peer_anchor
-    assert peers is not None
-    return own + peers + rounding_error
-
-
 def pinned_down(
     knowledge: Knowledge,
-    belief: Belief,
     placement: Placement,
     ranged: Sequence[PairObservation],
+    anchor_errors: float,
     error_bound: float,
 ) -> bool:
     """Return whether the observations in `ranged` determine `placement` to SURE.
 
-    `error_bound` is `combined_error`. Only rounding between the first and the last observation makes the
+    `anchor_errors` is the bound in m on the errors of both anchors, and `error_bound` that on them and on the
+    rounding errors of both odometries. Only rounding between the first and the last observation makes the
     errors of their ranges differ. Rounding before the first one shifts all ranges alike, as an anchor error
     does.
     """
@@ -170,7 +161,5 @@ def pinned_down(
     floor = 0.0
     for log in (knowledge.log, knowledge.peer_state.peer):
         floor += 0.5 * _path_rounding(extent, log.between(first, last), period)
-    rotation_error = turn_error(
-        placement, ranged, floor, combined_error(belief, odometry_rounding(knowledge, first))
-    )
+    rotation_error = turn_error(placement, ranged, floor, anchor_errors + odometry_rounding(knowledge, first))
     return error_bound + rotation_error * max(1.0, extent) <= SURE

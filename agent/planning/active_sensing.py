@@ -16,11 +16,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.elementary import eigh, exp, hypot, inverted, product
-from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.estimation.gaussian.odometry_noise import Array, Places
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.planning import separation
-from agent.planning.strides import STRIDES_AHEAD, Choice, choice, stride
+from agent.planning.state import RobotState
+from agent.planning.strides import STRIDES_AHEAD, Choice, choice, is_stalled, stride
+from agent.planning.tasks import Beacon, Surveying
 from protocol.mission import HEADING_ACCURACY, Mission, Role
 from protocol.motion import Controls
 
@@ -59,6 +61,19 @@ CONTINUED = Objective(STRIDES_AHEAD, OUTSIDE_COST, 0.0)
 
 STALLED = Objective(1, OUTSIDE_COST_ALONE, STALLED_COST)
 """The objective of stalled robots: the next stride counts alone, and they move (see `strides`)."""
+
+
+def next_objective(state: RobotState, beacon: Beacon, paths: Sequence[Track]) -> tuple[int, Objective]:
+    """Return the tick of the first of the consecutive plans about `beacon`, and the next objective.
+
+    `paths` are those of the robots that plan together.
+    """
+    match state.task:
+        case Surveying(before, _, since) if before == beacon:
+            mission = state.config.mission
+            return since, STALLED if is_stalled(paths, since, stride(mission), mission) else CONTINUED
+        case _:
+            return state.tick, CONTINUED
 
 
 def plan_alone(

@@ -85,7 +85,7 @@ def after_failure(state: RobotState) -> RobotState:
     if its meetings with all others have.
     """
     config = state.config
-    if state.belief.phase1_done_tick is None:
+    if state.own_anchor.done_tick is None:
         return state.with_agenda(robot_verdict=state.verdict)
     now, others = state.elapsed, [one.robot for one in config.members if one.robot != config.robot]
     if now >= config.gives_up or (state.verdict is None and all(state.other(one).failed for one in others)):
@@ -162,23 +162,13 @@ def _aligned(state: RobotState) -> RobotState:
 def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotState:
     """Return `state` in a new meeting with `peer`, of which the robot knows only its ranges to it."""
     state = state.with_other(state.config.peer, mutual=state.mutual)
-    belief, mutual = state.belief, state.other(peer).mutual
+    mutual = state.other(peer).mutual
     return replace(
         state,
         config=state.config.in_meeting(peer, role, orbits),
         mutual=mutual,
         in_contact=bool(mutual) and mutual[-1].tick == state.tick,
-        belief=Belief(
-            possible=belief.possible,
-            branch=belief.branch,
-            branch_kind=belief.branch_kind,
-            phase1_done_tick=belief.phase1_done_tick,
-            own_anchor=belief.own_anchor,
-            own=belief.own,
-            branches=belief.branches,
-            ranges_at_last_fit=belief.ranges_at_last_fit,
-            earlier_ranges=len(mutual),
-        ),
+        belief=Belief(earlier_ranges=len(mutual)),
         peer_state=PeerState(),
         task=Asleep(),
         plan=None,

@@ -2,66 +2,65 @@
 
 With exact sensors, it follows the paper's phases with more manoeuvres to choose from, until one placement is
 left and a redundant range has confirmed it. With noisy sensors, it measures until the poses are as accurate
-as the mission asks (`accuracy_seeking`).
+as the mission asks, in the phases of the paper (`phase1_survey`, `phase2_pursuit`, `phase3_survey`).
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Sequence
 
-from agent.estimation.gaussian.inference import PlanningHypothesis
-from agent.planning import accuracy_seeking, active_sensing, exchange, phase2_orbit, turns
-from agent.planning.accuracy_seeking import JointManoeuvres
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
+from agent.planning import (
+    active_sensing,
+    exchange,
+    phase1_anchor,
+    phase1_survey,
+    phase2_orbit,
+    phase2_pursuit,
+    phase3_survey,
+    tasks,
+    turns,
+)
 from agent.planning.drive import controls
-from agent.planning.exchange import LogPlanner
+from agent.planning.exchange import LogPlanner, Steps
+from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
-from agent.planning.tasks import Done, Listening, Orbital, Resting, Surveying, Travelling
+from agent.planning.strides import is_planning_tick
 from protocol.messages import Command, Report
 from protocol.mission import Mission
 from protocol.motion import REST, Controls
 
 
-class Steps(NamedTuple):
-    """The steps of `assured` that differ with what later ranges tell: chosen once, by the estimator."""
-
-    phase1: Callable[[RobotState, Manoeuvres], RobotState]
-    """It continues phase 1 after a second or further range to the anchor."""
-    phase2: Callable[[RobotState, Orbital, bool], RobotState]
-    """It continues phase 2 from a task; the last argument says whether there is a new range to the anchor."""
-    phase3: Callable[[RobotState, JointManoeuvres], RobotState]
-    """It begins phase 3 in contact with the peer, if that can begin."""
-
-
-BY_TURNS = Steps(turns.continue_phase1, phase2_orbit.continued, turns.met)
-"""The paper's steps, with more manoeuvres to choose from."""
-
-BY_ACCURACY = Steps(
-    accuracy_seeking.continue_phase1, accuracy_seeking.continue_phase2, accuracy_seeking.decided
-)
-"""The steps of robots whose pose each range corrects."""
-
-
 class Assured(LogPlanner):
     """The planner `assured`. Subclasses may plan other manoeuvres of phase 3, and choose a `SOLVER`."""
 
-    MANOEUVRES = accuracy_seeking.MANOEUVRES
+    MANOEUVRES = Manoeuvres(
+        directions=(1.0, -1.0), sides=(1.0, -1.0), last_speeds=LAST_SPEEDS, fewest_out_of_range=True
+    )
+    """Both ways, to both sides in phase 1, and at several speeds."""
+    DEAD_RECKONED = Steps(
+        phase1_anchor.unranged, phase1_anchor.until_accurate, phase2_orbit.continued, turns.met
+    )
+    """The paper's steps, with more manoeuvres to choose from."""
+    CORRECTED = Steps(
+        phase1_survey.unranged, phase1_survey.continued, phase2_pursuit.continued, phase3_survey.decided
+    )
     ACTIVE_SENSING = True
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports` and with the task that follows from them."""
         if reports:
             state = exchange.with_reports(state, reports)
-        if not state.in_contact or isinstance(state.task, Done):
+        if not state.in_contact or isinstance(state.task, tasks.Done):
             return state
         match state.task:
-            case Orbital() | Travelling():
-                return self._steps(state).phase3(state, self.joint_manoeuvres)
-            case Resting():
+            case tasks.Orbital() | tasks.Travelling():
+                return self.steps(state).phase3(state, self.joint_manoeuvres)
+            case tasks.Resting():
                 return turns.decided(state, self.last_manoeuvre)
-            case Listening() | Surveying("peer") if accuracy_seeking.is_planning_tick(state):
-                return accuracy_seeking.decided(state, self.joint_manoeuvres)
+            case tasks.Listening() | tasks.Surveying("peer") if is_planning_tick(state):
+                return phase3_survey.decided(state, self.joint_manoeuvres)
             case _:
                 return state
 
@@ -94,19 +93,15 @@ class Assured(LogPlanner):
         return (
             state.in_contact
             and (state.peer_state.start is None or state.config.role == "a")
-            and isinstance(state.task, Orbital | Travelling)
+            and isinstance(state.task, tasks.Orbital | tasks.Travelling)
         )
 
-    def _steps(self, state: RobotState) -> Steps:
-        """Return the steps for the sensors of the mission."""
-        return BY_ACCURACY if state.estimator.corrects_poses else BY_TURNS
-
-    def _continue_phase2(self, state: RobotState, task: Orbital, ranged: bool) -> RobotState:
-        return self._steps(state).phase2(state, task, ranged)
-
     def _sense(self, state: RobotState, ranged: bool) -> RobotState:
-        """Continue active sensing, or search for the anchor: only under noise."""
-        return accuracy_seeking.sensed(state, ranged)
-
-    def _after_range(self, state: RobotState) -> RobotState:
-        return self._steps(state).phase1(state, self.MANOEUVRES)
+        """Continue active sensing, or the search for the anchor: only under noise."""
+        match state.task:
+            case tasks.Surveying("anchor") | tasks.Homing() as task:
+                return phase1_survey.sensed(state, task, ranged)
+            case tasks.Surveying() | tasks.Listening() | tasks.Retreating() as task:
+                return phase3_survey.sensed(state, task)
+            case _:
+                return state

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
 from agent.estimation.gaussian.contact_fit import ContactEstimate, contact_measurements, estimated
-from agent.estimation.gaussian.inference import path_of
+from agent.estimation.gaussian.mission_measurements import path_of
 from agent.peer.motion_log import MotionLog
 from agent.planning import sweep
 from agent.planning.planner import Summary

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import msgspec
 from msgspec.structs import replace
@@ -13,7 +14,6 @@ from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import (
     phase1_anchor,
-    phase2_orbit,
     phase3_last_manoeuvre,
     plausibility,
     range_seeking,
@@ -70,12 +70,10 @@ def observed(state: RobotState, observation: Observation) -> RobotState:
 
 def _reported_log(state: RobotState) -> MotionLog:
     """Return the log of the robot, falsified if its configuration contains an attack."""
-    attack, belief = state.config.attack, state.belief
+    attack, ends = state.config.attack, (state.own_anchor.done_tick, state.belief.encounter_tick)
     if attack is None:
         return state.log
-    return false_reports.falsified_log(
-        state.log, attack, belief.phase1_done_tick, belief.encounter_tick, state.config.mission.period
-    )
+    return false_reports.falsified_log(state.log, attack, *ends, state.config.mission.period)
 
 
 def reported_pose(state: RobotState, frame: Pose) -> Pose:
@@ -83,7 +81,7 @@ def reported_pose(state: RobotState, frame: Pose) -> Pose:
 
     That of an attacker follows from the start and the log that it reports to its peers.
     """
-    attack, branch = state.config.attack, state.belief.branch
+    attack, branch = state.config.attack, state.own_anchor.branch
     if attack is None or branch is None:
         return compose(frame, state.odometry)
     pose = compose(compose(frame, inverse(branch.start)), false_reports.start(branch.start, attack))
@@ -120,7 +118,7 @@ def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
         )
         state = replace(state, peer_state=updated)
         if objection is not None:
-            return state.inconsistent(objection)
+            return state.ended(objection)
     if state.verdict is None:
         match state.peer_state.verdict:
             case Undecided(reason):
@@ -167,11 +165,28 @@ KEPT_PLACES = 3
 """The number of relative placements that a claim from exact ranges needs; two leave several solutions."""
 
 
+class Steps(NamedTuple):
+    """The steps of a planner that depend on the sensors: chosen once, by the estimator."""
+
+    unranged: Callable[[RobotState], RobotState]
+    """It follows a tick of a robot that has not measured a range to its anchor yet."""
+    phase1: Callable[[RobotState, Manoeuvres], RobotState]
+    """It continues phase 1 after a second or further range to the anchor."""
+    phase2: Callable[[RobotState, tasks.Orbital, bool], RobotState]
+    """It continues phase 2 from a task; the last argument says whether there is a new range to the anchor."""
+    phase3: Callable[[RobotState, Any], RobotState]
+    """It begins phase 3 in contact with the peer, if that can begin. It may plan by `joint_manoeuvres`."""
+
+
 class LogPlanner(Planner[RobotState, Report]):
     """A planner with the state of the shipped planners. Subclasses define `decide` and `command`."""
 
     BODY = Report
     MANOEUVRES: Manoeuvres
+    DEAD_RECKONED: Steps
+    """The steps of a robot that knows its pose from the end of phase 1 on."""
+    CORRECTED: Steps
+    """The steps of a robot whose pose each range corrects."""
     SOLVER: Solver | None = None
     """The solver that fits the poses under noise; None for the smoother. A subclass may choose its own."""
     REQUIRED_PLACES = KEPT_PLACES
@@ -183,34 +198,34 @@ class LogPlanner(Planner[RobotState, Report]):
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, and with the task that follows from them."""
         state, ranged = observed(state, observation), observation.anchor_range is not None
-        task = state.task
+        task, steps = state.task, self.steps(state)
         match task:  # in real time, a manoeuvre may not have been executed
             case tasks.Orbiting(None) | tasks.Resting() | tasks.Done():  # most ticks
                 return state
             case tasks.Orbital():
-                return self._continue_phase2(state, task, ranged)
+                return steps.phase2(state, task, ranged)
             case tasks.Searching(beacon):
                 measured = state.in_contact if beacon == "peer" else ranged
                 seeking = range_seeking.onward(state, task, measured, self.MANOEUVRES)
                 if seeking is not None:
                     return state.doing(seeking)
-                return state.doing(tasks.Waiting()) if beacon == "peer" else self._after_range(state)
+                return (
+                    state.doing(tasks.Waiting()) if beacon == "peer" else steps.phase1(state, self.MANOEUVRES)
+                )
             case tasks.ThirdPoint(_, origin) if state.odometry != origin:
-                return self._after_range(state)
+                return steps.phase1(state, self.MANOEUVRES)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
                 return turns.after_last_manoeuvre(state, task)
-            case tasks.Asleep() if ranged or not state.estimator.corrects_poses:
+            case tasks.Asleep() if observation.anchor_range is not None:
                 return phase1_anchor.begun(state, observation.anchor_range)
-            case _:  # under noise, the first range may be missing by chance
+            case tasks.Asleep():
+                return steps.unranged(state)
+            case _:
                 return self._sense(state, ranged)
 
-    def _after_range(self, state: RobotState) -> RobotState:
-        """Return `state` with the next task of phase 1, after a second or further range to the anchor."""
-        raise NotImplementedError
-
-    def _continue_phase2(self, state: RobotState, task: tasks.Orbital, ranged: bool) -> RobotState:
-        """Return `state` with the task that follows `task`; `ranged` if it has a new range to its anchor."""
-        return phase2_orbit.continued(state, task, ranged)
+    def steps(self, state: RobotState) -> Steps:
+        """Return the steps for the sensors of the mission."""
+        return self.CORRECTED if state.estimator.corrects_poses else self.DEAD_RECKONED
 
     def _sense(self, state: RobotState, ranged: bool) -> RobotState:
         """Return `state` with the task that follows one that the paper does not have: the robot waits."""
@@ -223,7 +238,7 @@ class LogPlanner(Planner[RobotState, Report]):
         If the configuration contains an attack, the report holds the falsified log (see `protocol.attack`).
         """
         since, ranges_since = state.peer_state.acknowledged, state.peer_state.ranges_acknowledged
-        start = state.belief.branch.start if state.belief.branch and state.phase > 1 else None
+        start = state.own_anchor.branch.start if state.own_anchor.branch and state.phase > 1 else None
         log = _reported_log(state)
         if (attack := state.config.attack) is not None:
             start = false_reports.start(start, attack) if start is not None else None
@@ -242,10 +257,10 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def estimate(self, state: RobotState) -> Estimate:
         """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
-        belief, verdict = state.belief, state.verdict
-        branches_left = belief.branches
-        if not branches_left and belief.branch is not None:
-            branches_left = (belief.branch,)
+        own, belief, verdict = state.own_anchor, state.belief, state.verdict
+        branches_left = own.branches
+        if not branches_left and own.branch is not None:
+            branches_left = (own.branch,)
         elif not branches_left and isinstance(state.task, tasks.ThirdPoint):
             branches_left = state.task.branches
         if belief.poses:
@@ -260,7 +275,7 @@ class LogPlanner(Planner[RobotState, Report]):
             local=tuple(phase1_anchor.local(branches_left, state.odometry)),
             world=world,
             localised=isinstance(verdict, Localised),
-            probabilities=tuple([one.probability for one in belief.pair or belief.own]),
+            probabilities=tuple([one.probability for one in belief.pair or own.hypotheses]),
             covariance=belief.covariance,
         )
 
@@ -282,13 +297,13 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def summary(self, state: RobotState) -> Summary:
         """Return the numbers of ranges and hypotheses, and the last manoeuvre."""
-        belief, plan = state.belief, state.plan
+        own, belief, plan = state.own_anchor, state.belief, state.plan
         return Summary(
             anchor_ranges=len(state.log.ranges),
             mutual_ranges=len(state.mutual),
             reports_heard=state.peer_state.heard,
-            branch=belief.branch_kind,
-            alpha=belief.branch.alpha if belief.branch is not None else None,
+            branch=own.kind,
+            alpha=own.branch.alpha if own.branch is not None else None,
             candidates=belief.candidates,
             last_turn_rate=plan.command.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,

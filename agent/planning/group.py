@@ -111,7 +111,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         alone = not before.meets or appointments.refused(before, peer)
         of_peer = [] if alone else [one for one in logs if one.robot == peer]
         state = self.pair_planner.decide(before, of_peer)
-        if before.verdict is None and state.verdict is not None and state.belief.phase1_done_tick is None:
+        if before.verdict is None and state.verdict is not None and state.own_anchor.done_tick is None:
             return appointments.parted(before, state.verdict)  # it goes on with phase 1
         silence = state.agenda.silence + 1 if state.in_contact and not of_peer else 0
         if silence != state.agenda.silence:

@@ -72,9 +72,9 @@ class MeetingPlanner(Planner[RobotState, Report]):
         state = replace(state, peer_state=peer).with_agenda(own=(state.agenda.meeting, own))
         if isinstance(state.task, Done) or (isinstance(state.task, Travelling) and not state.in_contact):
             return state
-        command, belief = self._planner.command(own), state.belief
-        if belief.phase1_done_tick is None and (command.phase > 1 or command.verdict is not None):
-            state = replace(state, belief=replace(belief, phase1_done_tick=state.tick))
+        command, known = self._planner.command(own), state.own_anchor
+        if known.done_tick is None and (command.phase > 1 or command.verdict is not None):
+            state = replace(state, own_anchor=replace(known, done_tick=state.tick))
         if command.verdict is not None:
             return state.doing(Done(command.phase, command.verdict))
         return state.doing(Deciding(command.phase, command.task))

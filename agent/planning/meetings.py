@@ -52,7 +52,7 @@ def with_sender(state: RobotState, report: Report) -> RobotState:
 
 def answering(state: RobotState, visitors: Sequence[str]) -> RobotState:
     """Return `state` in a meeting with one of `visitors`, which have come to it, if it waits for one."""
-    if not state.waits or state.belief.phase1_done_tick is None:
+    if not state.waits or state.own_anchor.done_tick is None:
         return state
     peer = state.config.peer
     if peer in visitors and not (state.agenda.alone or appointments.refused(state, peer)):
@@ -136,7 +136,7 @@ def after_refusal(state: RobotState) -> RobotState:
         return appointments.next_visit(appointments.parted(state))
     why = Undecided(f"{state.config.peer} does not go on with the meeting")
     failed = appointments.parted(state, why)
-    return failed if state.belief.phase1_done_tick is None else appointments.resumed(failed)
+    return failed if state.own_anchor.done_tick is None else appointments.resumed(failed)
 
 
 def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:

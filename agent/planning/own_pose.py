@@ -12,8 +12,8 @@ from collections.abc import Sequence
 from msgspec.structs import astuple, replace
 
 from agent.estimation.claim import NORMAL_RATIO, Blocked, blocked, claim, consistency, convergence
-from agent.estimation.gaussian import inference
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import Judged, User, of_pair
 from agent.estimation.knowledge import Knowledge
@@ -52,9 +52,6 @@ an anchor count less.
 SMALLEST_LOSS = 1e-6
 """The smallest difference of log-likelihoods by which another one is divided."""
 
-Estimated = tuple[tuple[Hypothesis, ...], Judged | None]
-"""The hypotheses about a pair, and the first of them as the conditions of a claim see it."""
-
 
 def updated(state: RobotState) -> RobotState:
     """Return `state` with a new estimate of the pose, if one is due."""
@@ -63,7 +60,7 @@ def updated(state: RobotState) -> RobotState:
     ranged |= bool(state.mutual) and state.mutual[-1].tick == state.tick
     if before is not None and state.tick - before < (REFIT_WITH_RANGES if ranged else REFIT):
         return state
-    return _with_estimate(state, *_estimate(state, searched=False))
+    return _with_estimate(state, *_estimated("finder", state, _measured(state), searched=False))
 
 
 def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
@@ -73,7 +70,7 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     describes, so there must be RANGES_AGAIN. If poses many sigmas away are likelier than the ellipse says,
     the covariance is widened until it says as much, but at most by MOST_WIDENED.
     """
-    found, judged = _estimate(state, searched=True)
+    found, judged = _estimated("finder", state, _measured(state), searched=True)
     state = _with_estimate(state, found, judged)
     reference = _reference(state, judged)
     return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
@@ -89,12 +86,9 @@ def beacon_place(state: RobotState) -> Place:
     return state.config.m1.x + x, state.config.m1.y + y
 
 
-def _estimate(state: RobotState, *, searched: bool) -> Estimated:
-    """Return the estimate by all measurements of the latest meeting."""
-    return _estimated("finder", state, _measured(state), searched=searched)
-
-
-def _estimated(user: User, known: Knowledge, measured: JointMeasurements, *, searched: bool) -> Estimated:
+def _estimated(
+    user: User, known: Knowledge, measured: JointMeasurements, *, searched: bool
+) -> tuple[tuple[Hypothesis, ...], Judged | None]:
     """Return the hypotheses by what was `measured`, and the first one as `claim` sees it for `user`.
 
     The whole plane is searched if the `known` hypotheses do not explain it, or if `searched`.
@@ -109,7 +103,7 @@ def _estimated(user: User, known: Knowledge, measured: JointMeasurements, *, sea
 
 def _measured(state: RobotState) -> JointMeasurements:
     """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
-    measured = inference.pair_of(state)
+    measured = pair_of(state)
     claimed = state.agenda.located.tick if state.agenda.located is not None else -1
     return measured.thinned_after(claimed, MOST_WEIGHED)
 
@@ -164,5 +158,5 @@ def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
     long way was 0.3 m off, with a sigma of 0.02 m.
     """
     met = replace(met, tick=now.tick, odometry=now.odometry, log=now.log)
-    claimed = claim(_estimated("meeting", met, inference.pair_of(met), searched=True)[1])
+    claimed = claim(_estimated("meeting", met, pair_of(met), searched=True)[1])
     return claimed if isinstance(claimed, Localised) else None

@@ -9,11 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agent.planning import drive, exchange, phase1_anchor, turns
-from agent.planning.exchange import LogPlanner
+from agent.planning import drive, exchange, phase1_anchor, phase2_orbit, turns
+from agent.planning.exchange import LogPlanner, Steps
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
-from agent.planning.tasks import Orbiting, Resting, Standing, ThirdPoint, Waiting
+from agent.planning.tasks import Orbiting, Resting, Standing, Waiting
 from protocol.messages import Command, Report
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
@@ -24,6 +24,11 @@ class Paper(LogPlanner):
 
     MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewest_out_of_range=False)
     """Forward, to the left in phase 1, and at v_max."""
+    DEAD_RECKONED = Steps(
+        phase1_anchor.unranged, phase1_anchor.as_published, phase2_orbit.continued, turns.met_on_orbits
+    )
+    CORRECTED = DEAD_RECKONED._replace(unranged=lambda state: state)
+    """A first range may be missing by chance."""
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports` and with the task that follows from them.
@@ -35,8 +40,8 @@ class Paper(LogPlanner):
         if not state.in_contact:
             return state
         match state.task:
-            case Orbiting() if state.peer_state.phase == 3 or state.peer_state.state == state.task.name:
-                return turns.begun(state)
+            case Orbiting():
+                return self.steps(state).phase3(state, None)
             case Resting():
                 return self._decide_phase3(state)
             case _:
@@ -49,20 +54,6 @@ class Paper(LogPlanner):
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
         return exchange.command(state, drive.controls(state))
-
-    def _after_range(self, state: RobotState) -> RobotState:
-        """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
-
-        The third range is the last one. It selects the most probable branch, if there is one.
-        """
-        third = isinstance(state.task, ThirdPoint)
-        state, estimate, kind = phase1_anchor.with_branches(state)
-        branch = estimate.best if third or len(estimate.branches) == 1 else None
-        if kind is not None and branch is not None:
-            return phase1_anchor.ended(state, state.estimator.fitted(state, branch), kind)
-        if estimate.branches and third:
-            return state.undecided("the third range does not distinguish +alpha from -alpha")
-        return phase1_anchor.to_third_point(state, estimate, self.MANOEUVRES)
 
     def _decide_phase3(self, state: RobotState) -> RobotState:
         """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.

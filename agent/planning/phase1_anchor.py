@@ -8,7 +8,7 @@ from itertools import combinations
 
 from msgspec.structs import replace
 
-from agent.estimation.estimator import AnchorEstimate, FittedBranch
+from agent.estimation.estimator import AnchorEstimate
 from agent.estimation.exact import Branch
 from agent.planning import phase2_orbit, tasks
 from agent.planning.planner import Manoeuvres
@@ -108,17 +108,47 @@ def local(branches: Sequence[Branch], odometry: Pose) -> list[Pose]:
     return [compose(branch.start, odometry) for branch in branches]
 
 
-def begun(state: RobotState, rho0: float | None) -> RobotState:
-    """Start phase 1 with the first anchor range `rho0` in m; None if the anchor was not detected."""
-    if rho0 is None:
-        return state.undecided("the anchor is out of range at the start")
+def unranged(state: RobotState) -> RobotState:
+    """Return `state` of a robot that has not detected its anchor at the start, and cannot continue."""
+    return state.undecided("the anchor is out of range at the start")
+
+
+def begun(state: RobotState, rho0: float) -> RobotState:
+    """Start phase 1 with the first anchor range `rho0` in m."""
     on_anchor = state.estimator.on_anchor(state, rho0)
     if on_anchor is not None:
-        return ended(state, on_anchor, "on-anchor")
+        return _ended(state, on_anchor, "on-anchor")
     return state.doing(tasks.Straight("anchor", state.odometry, rho0))
 
 
-def with_branches(state: RobotState) -> tuple[RobotState, AnchorEstimate, BranchKind | None]:
+def as_published(state: RobotState, manoeuvres: Manoeuvres) -> RobotState:
+    """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
+
+    The third range is the last one. It selects the most probable branch, if there is one.
+    """
+    third = isinstance(state.task, tasks.ThirdPoint)
+    state, estimate, kind = _with_branches(state)
+    if kind is not None and estimate.best is not None and (third or len(estimate.branches) == 1):
+        return _ended(state, estimate, kind)
+    if estimate.branches and third:
+        return state.undecided("the third range does not distinguish +alpha from -alpha")
+    return _to_third_point(state, estimate, manoeuvres)
+
+
+def until_accurate(state: RobotState, manoeuvres: Manoeuvres) -> RobotState:
+    """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
+
+    Phase 1 ends when one branch is left, and the ranges determine the anchor's position as accurately as
+    a claim needs.
+    """
+    state, estimate, kind = _with_branches(state)
+    alone = len(estimate.branches) == 1
+    if kind is not None and alone and estimate.enough:
+        return _ended(state, estimate, kind)
+    return _to_third_point(state, estimate, manoeuvres, pinning=alone)
+
+
+def _with_branches(state: RobotState) -> tuple[RobotState, AnchorEstimate, BranchKind | None]:
     """Return `state` with the branches that its anchor ranges allow, these, and how phase 1 ends with one.
 
     The last is None if a further range has to check it. A third range that is missing is the paper's virtual
@@ -133,10 +163,10 @@ def with_branches(state: RobotState) -> tuple[RobotState, AnchorEstimate, Branch
         case tasks.Circling():
             kind = "circle"
     estimate = state.estimator.anchor(state, candidates)
-    return replace(state, belief=estimate.belief), estimate, kind
+    return replace(state, own_anchor=estimate.known), estimate, kind
 
 
-def to_third_point(
+def _to_third_point(
     state: RobotState, estimate: AnchorEstimate, manoeuvres: Manoeuvres, *, pinning: bool = False
 ) -> RobotState:
     """Plan the manoeuvre to the next measurement point of phase 1 (see `third_point`)."""
@@ -149,13 +179,9 @@ def to_third_point(
     return state.doing(tasks.ThirdPoint(estimate.branches, state.odometry, command))
 
 
-def ended(state: RobotState, fitted: FittedBranch, kind: BranchKind) -> RobotState:
-    """End phase 1: store the branch and the anchor error of `fitted`, and start phase 2."""
-    belief = replace(
-        state.belief,
-        branch=fitted.branch,
-        branch_kind=kind,
-        phase1_done_tick=state.tick,
-        own_anchor=fitted.anchor_error,
+def _ended(state: RobotState, estimate: AnchorEstimate, kind: BranchKind) -> RobotState:
+    """End phase 1: store the best branch and the anchor error of `estimate`, and start phase 2."""
+    own_anchor = replace(
+        estimate.known, branch=estimate.best, kind=kind, done_tick=state.tick, error=estimate.anchor_error
     )
-    return phase2_orbit.begun(replace(state, belief=belief))
+    return phase2_orbit.begun(replace(state, own_anchor=own_anchor))

@@ -112,6 +112,7 @@ def next_part(state: RobotState) -> RobotState:
             state,
             config=located.config,
             mutual=located.mutual,
+            own_anchor=located.own_anchor,
             belief=located.belief,
             peer_state=located.peer_state,
         )

@@ -13,7 +13,7 @@ from agent.estimation.knowledge import Knowledge
 from agent.planning.agenda import Agenda, Other
 from agent.planning.phase3_last_manoeuvre import Plan
 from agent.planning.tasks import Asleep, Done, Looping, Sweeping, Task
-from protocol.messages import Inconsistent, Undecided, Verdict
+from protocol.messages import Localised, Undecided, Verdict
 from protocol.motion import ORIGIN, Pose, compose, inverse
 from protocol.orbits import Orbit
 
@@ -51,13 +51,13 @@ class RobotState(Knowledge, frozen=True):
         """Return the verdict of the present meeting, or None if the robot has not reached one."""
         return self.task.verdict if isinstance(self.task, Done) else None
 
+    def ended(self, verdict: Verdict) -> RobotState:
+        """Return this state, ended with `verdict`; a pose is claimed in phase 3."""
+        return replace(self, task=Done(3 if isinstance(verdict, Localised) else self.phase, verdict))
+
     def undecided(self, reason: str) -> RobotState:
         """Return this state, ended with the verdict Undecided: the robot cannot continue."""
-        return replace(self, task=Done(self.phase, Undecided(reason)))
-
-    def inconsistent(self, contradiction: Inconsistent) -> RobotState:
-        """Return this state, ended with the verdict Inconsistent: the peer's reports are contradictory."""
-        return replace(self, task=Done(self.phase, contradiction))
+        return self.ended(Undecided(reason))
 
     @property
     def waits(self) -> bool:

@@ -13,6 +13,7 @@ from agent.estimation.elementary import cos, sin
 from agent.estimation.gaussian.joint_ranges import MOVED
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track, ratio_of_chord
 from agent.planning import separation
+from agent.planning.state import RobotState
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, placed
 
@@ -35,6 +36,11 @@ SLOW = (0.1, -0.1)
 def stride(mission: Mission) -> int:
     """Return the number of ticks of a manoeuvre. Ranges from nearer points are hardly more informative."""
     return max(1, round(STRIDE_LENGTH * mission.sensing_range / mission.first_straight))
+
+
+def is_planning_tick(state: RobotState) -> bool:
+    """Return whether the robot plans a manoeuvre in this tick. Both robots plan in the same ticks."""
+    return state.tick % stride(state.config.mission) == 0
 
 
 class Choice(NamedTuple):

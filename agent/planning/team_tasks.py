@@ -14,9 +14,9 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.following import Following
-from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, track
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.posterior import Hypothesis
 from agent.planning import separation

@@ -7,14 +7,20 @@ from collections.abc import Callable
 from msgspec.structs import replace
 
 from agent.estimation.estimator import PairEstimate
-from agent.planning import phase1_anchor, phase3_last_manoeuvre, tasks
+from agent.planning import phase3_last_manoeuvre, tasks
 from agent.planning.phase3_last_manoeuvre import Plan, Question
-from agent.planning.planner import Manoeuvres
 from agent.planning.range_seeking import step_length
 from agent.planning.state import RobotState
 from protocol.messages import Localised
 from protocol.mission import SHORTEST_STEP, Mission
 from protocol.motion import Controls
+
+
+def met_on_orbits(state: RobotState, planned: object) -> RobotState:
+    """Begin phase 3 once both robots are on their orbits, as published."""
+    del planned
+    peer = state.peer_state
+    return begun(state) if peer.phase == 3 or peer.state == state.task.name else state
 
 
 def begun(state: RobotState) -> RobotState:
@@ -75,8 +81,8 @@ def pair_estimate(
     estimate = state.estimator.pair(state, first_tick, second_range=second_range)
     if estimate is None:
         return state, None
-    task = state.task if estimate.verdict is None else tasks.Done(3, estimate.verdict)
-    return replace(state, belief=estimate.belief, task=task), estimate
+    state = replace(state, belief=estimate.belief)
+    return state if estimate.verdict is None else state.ended(estimate.verdict), estimate
 
 
 def last_manoeuvre(
@@ -104,21 +110,6 @@ PEER_RESTS = (tasks.Standing.name, tasks.Waiting.name)
 
 If both moved at once, they might do so in mirror image, and the new range would not select a placement.
 """
-
-
-def continue_phase1(state: RobotState, manoeuvres: Manoeuvres) -> RobotState:
-    """Continue phase 1 with the branches +alpha and -alpha that the ranges allow (eq. (2)).
-
-    Phase 1 ends when one branch is left, and the ranges determine the anchor's position as accurately as
-    a claim needs.
-    """
-    state, estimate, kind = phase1_anchor.with_branches(state)
-    alone = len(estimate.branches) == 1
-    if kind is not None and alone:
-        fitted = state.estimator.fitted(state, estimate.branches[0])
-        if fitted.enough:
-            return phase1_anchor.ended(state, fitted, kind)
-    return phase1_anchor.to_third_point(state, estimate, manoeuvres, pinning=alone)
 
 
 def met(state: RobotState, planned: object) -> RobotState:

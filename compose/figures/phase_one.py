@@ -50,18 +50,18 @@ class DrawnBranch(NamedTuple):
 def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Absent:
     """Return the figure of the branches, with circles of the measured ranges and of the sensing range."""
     states = pair.states(role)
-    ended = next((state for state in states if state.belief.phase1_done_tick is not None), None)
+    ended = next((state for state in states if state.own_anchor.done_tick is not None), None)
     state = ended or next((state for state in reversed(states) if state.phase == 1), None)
     if state is None:
         return Absent("the recording has no tick of the robot")
     branches = _branches(states, state)
     if not branches:
-        on_anchor = state.belief.branch_kind == "on-anchor"
+        on_anchor = state.own_anchor.kind == "on-anchor"
         return Absent("the robot starts on its anchor" if on_anchor else "the robot has no second range")
     track, reach, first = state.seen(), pair.mission.sensing_range, branches[0]
     ranged = [(tick, rho) for tick, (_, rho) in enumerate(track) if rho is not None]
     virtual = None
-    if state.belief.branch_kind == "three-ranges-virtual":
+    if state.own_anchor.kind == "three-ranges-virtual":
         virtual = first.branch.distance(state.odometry)
     sheet = Sheet(medium, True, [pair.title, _title(pair, role, state)])
     axes = sheet.panels["plane"]
@@ -86,13 +86,13 @@ def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Abse
 
 def _branches(states: Sequence[RobotState], end: RobotState) -> list[DrawnBranch]:
     """Return the branches considered in phase 1, the selected one first."""
-    exact, done = end.config.mission.noise.exact, end.belief.phase1_done_tick is not None
+    exact, done = end.config.mission.noise.exact, end.own_anchor.done_tick is not None
     if exact:
-        branches, selected = list(end.belief.possible), end.belief.branch
+        branches, selected = list(end.own_anchor.possible), end.own_anchor.branch
     else:
         until = [state for state in states if state.tick <= end.tick]
-        branches = list(max(until, key=lambda state: len(state.belief.branches)).belief.branches)
-        selected = end.belief.branches[0] if done else None
+        branches = list(max(until, key=lambda state: len(state.own_anchor.branches)).own_anchor.branches)
+        selected = end.own_anchor.branches[0] if done else None
     if branches and selected is not None:
         branches.sort(key=lambda one: math.dist(one.anchor, selected.anchor))
         branches[0] = selected  # its estimate uses all measurements up to the end of phase 1
@@ -112,7 +112,7 @@ def _branches(states: Sequence[RobotState], end: RobotState) -> list[DrawnBranch
 
 
 def _title(pair: PairRecord, role: Role, state: RobotState) -> str:
-    kind, done = state.belief.branch_kind, state.belief.phase1_done_tick
+    kind, done = state.own_anchor.kind, state.own_anchor.done_tick
     more = {"three-ranges-virtual": " and a virtual one", "circle": " and no detection on the circle"}
     result = f"{len(state.log.ranges)} ranges{more.get(kind or '', '')}, finished at $k$ = {done}"
     if done is None:

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import numpy as np
 
 from agent.estimation.elementary import eigh, inverted, product, quadratic, solve
-from agent.estimation.gaussian import inference
-from agent.estimation.gaussian.inference import covariance_of
+from agent.estimation.gaussian.mission_measurements import path_of
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Projection,
@@ -23,6 +22,7 @@ from agent.estimation.gaussian.odometry_noise import (
     spread,
     wander,
 )
+from agent.estimation.gaussian.planning_hypotheses import covariance_of
 from agent.estimation.smoother import Singular
 from agent.peer.motion_log import MotionLog
 from protocol.messages import Localised
@@ -57,7 +57,7 @@ def difference(
     independent. Claims share the ranges to the robot's own anchor, so they differ by less, and the p-value is
     too large rather than too small. It is 0 if a covariance is singular, which explains no difference.
     """
-    path = inference.path_of(log, 0, through, mission)
+    path = path_of(log, 0, through, mission)
     here, there = (
         Pose(float(path.x[tick]), float(path.y[tick]), float(path.heading[tick])) for tick in (since, through)
     )

@@ -17,9 +17,9 @@ from msgspec.structs import replace
 
 from agent.estimation.elementary import eigh
 from agent.estimation.fit import Fit, deviation, held_fits
-from agent.estimation.gaussian.inference import PlanningHypothesis
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
 from agent.estimation.gaussian.odometry_noise import Array
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 
 WRONG_SIGMAS = 5.0
 """The number of claimed sigmas from which on the referee calls a claim wrong."""

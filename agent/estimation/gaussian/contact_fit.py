@@ -19,10 +19,10 @@ from agent.estimation.elementary import inverted
 from agent.estimation.fit import TO_THE_END
 from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
 from agent.estimation.gaussian.consistency import chi2_p_value
-from agent.estimation.gaussian.inference import covariance_of
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, PosePrior
 from agent.estimation.gaussian.measured_rows import Listed, near_anchors
 from agent.estimation.gaussian.odometry_noise import Track
+from agent.estimation.gaussian.planning_hypotheses import covariance_of
 from agent.estimation.gaussian.search import extended
 from agent.estimation.judged import of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, follow

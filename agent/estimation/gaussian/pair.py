@@ -1,0 +1,172 @@
+"""The estimate of a pair with noisy sensors: its hypotheses from tick to tick, their tests, and the claim."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from msgspec.structs import replace
+
+from agent.estimation.claim import (
+    BEFORE_SEARCH,
+    CONDITIONS,
+    Condition,
+    blocked,
+    claim,
+    early_consistency,
+    profiles,
+    rivals,
+)
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES, rejecting_p_value
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.mission_measurements import (
+    beginning,
+    known_through,
+    m2_of,
+    own_measurements,
+    pair_of,
+)
+from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, doubt
+from agent.estimation.gaussian.planning_hypotheses import (
+    PlanningHypothesis,
+    localised,
+    planning_hypothesis,
+    to_second_order,
+)
+from agent.estimation.gaussian.search import search
+from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, User, of_pair, sufficient_mutual_ranges
+from agent.estimation.knowledge import Belief, Knowledge
+from agent.estimation.posterior import PAIR, Posterior, settled
+from protocol.messages import Localised, Undecided, Verdict
+
+PAIR_SEARCHES = frozenset((FEWEST_FOR_CLAIM, *(8 * 2**n for n in range(12))))
+"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses.
+
+They only bound how long a missed hypothesis stays missed: the plane is also searched before each claim, and
+where the best fit does not converge. More searches cost time; with fewer, robots plan with too few
+hypotheses.
+"""
+
+
+class FollowedPair(NamedTuple):
+    """The estimate of a pair in one tick."""
+
+    measured: JointMeasurements
+    belief: Belief
+    hypotheses: tuple[PlanningHypothesis, ...] = ()
+    """The hypotheses for planning; the second one is the rival that blocks a claim, if one does."""
+    verdict: Verdict | None = None
+    """The verdict that follows from them; None if it depends on further ranges."""
+
+
+def followed(knowledge: Knowledge) -> FollowedPair:
+    """Return the estimate of both robots, by the hypotheses of the last tick or by a search.
+
+    The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit does not
+    converge, and before a claim or a suspicion.
+    """
+    measured, belief = pair_of(knowledge), _of_this_attempt(knowledge)
+    mutual = int(np.count_nonzero(measured.ranges.mutual))
+    if mutual < FEWEST_FOR_CLAIM:
+        return FollowedPair(measured, belief)
+    knowledge = replace(knowledge, belief=belief)
+    known = settled(Posterior(PAIR, belief.pair), measured)
+    due = any(belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
+    if known.hypotheses and known.has_converged and not due:
+        belief, _ = believed(knowledge, "assured", known, measured, BEFORE_SEARCH)
+        test = belief.inconsistency
+        if belief.blocking_reason is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
+            return FollowedPair(measured, belief, tuple([planning_hypothesis(one) for one in belief.pair]))
+    belief, judged = believed(knowledge, "assured", search(measured, known), measured, BEFORE_SEARCH)
+    return _searched(knowledge, measured, replace(belief, ranges_at_last_search=mutual), judged)
+
+
+def believed(
+    knowledge: Knowledge,
+    user: User,
+    found: Posterior,
+    measured: JointMeasurements,
+    conditions: Sequence[Condition] = CONDITIONS,
+) -> tuple[Belief, Judged | None]:
+    """Return the belief with the hypotheses `found`, and the first one as the conditions of a claim see it.
+
+    The belief has the first of the `conditions` that blocks the claim of `user`.
+    """
+    config, scored = knowledge.config, found.hypotheses
+    judged = of_pair(user, config, scored, measured)
+    if judged is not None and user == "assured" and not isinstance(knowledge.peer_state.verdict, Localised):
+        judged = judged._replace(rivals_of=(0, 1))
+    blocking = blocked(judged, conditions)
+    robot, m1 = 0 if config.role == "a" else 1, config.m1
+    claims = [
+        localised(to_second_order(one, m2_of(config)), robot, (m1.x, m1.y))
+        for one in map(planning_hypothesis, scored)
+    ]
+    first, _ = knowledge.belief.candidates or (len(scored), 0)
+    belief = replace(
+        knowledge.belief,
+        pair=scored,
+        poses=tuple([one.pose for one in claims]),
+        odometry=knowledge.odometry,
+        covariance=claims[0].covariance if claims else None,
+        candidates=(first, len(scored)),
+        inconsistency=judged and judged.inconsistency,
+        blocking_reason=blocking and blocking.reason,
+    )
+    return belief, judged
+
+
+def _of_this_attempt(knowledge: Knowledge) -> Belief:
+    """Return the belief without the hypotheses and tests of an attempt before a last began again."""
+    first = beginning(knowledge, known_through(knowledge))
+    if first == knowledge.belief.beginning:
+        return knowledge.belief
+    return replace(
+        knowledge.belief,
+        beginning=first,
+        pair=(),
+        candidates=None,
+        ranges_at_last_search=0,
+        inconsistency=None,
+        p_value=None,
+        inconsistent_searches=0,
+        doubtful_claims=0,
+        returns=0,
+    )
+
+
+def _searched(
+    knowledge: Knowledge, measured: JointMeasurements, belief: Belief, judged: Judged | None
+) -> FollowedPair:
+    """Return the estimate after a search of the plane: with a verdict, or with the reason against a claim.
+
+    After INCONSISTENT_SEARCHES consecutive failures of the consistency test, the verdict is Inconsistent, or
+    Undecided if the robot's own sensors are not as it was told. It is also Undecided if other profiles of the
+    sensors contradict all of its latest claims: then more ranges have not helped.
+    """
+    hypotheses, test = tuple([planning_hypothesis(one) for one in belief.pair]), belief.inconsistency
+    p_values = [belief.p_value, test.p_value if test is not None else None]
+    least = min([one for one in p_values if one is not None], default=None)
+    if test is not None and len(measured.mutual_places) >= sufficient_mutual_ranges(measured.noise):
+        failed = test.p_value < rejecting_p_value(measured.noise)
+        failures = belief.inconsistent_searches + 1 if failed else 0
+        belief = replace(belief, inconsistent_searches=failures, p_value=least)
+        if failures >= INCONSISTENT_SEARCHES:
+            own = own_measurements(knowledge).thinned_after()
+            doubted = doubt(own, measured, 0 if knowledge.config.role == "a" else 1)
+            contradiction = test if doubted is None else Undecided(doubted.reason())
+            return FollowedPair(measured, belief, hypotheses, contradiction)
+    if belief.blocking_reason is not None:
+        return FollowedPair(measured, belief, hypotheses)
+    found = claim(judged)
+    if isinstance(found, Localised):
+        return FollowedPair(measured, replace(belief, doubtful_claims=0, p_value=least), hypotheses, found)
+    doubtful = belief.doubtful_claims + (found.condition is profiles)
+    if found.condition not in (early_consistency, profiles):
+        doubtful = 0
+    if judged is not None and found.condition is rivals:
+        hypotheses = (hypotheses[0], judged.rival.hypothesis, *hypotheses[1:])
+    belief = replace(belief, blocking_reason=found.reason, doubtful_claims=doubtful)
+    verdict = Undecided(found.reason) if doubtful >= DOUBTFUL_CLAIMS else None
+    return FollowedPair(measured, belief, hypotheses, verdict)
