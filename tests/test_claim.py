@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import get_args
 
 import numpy as np
 import pytest
 from msgspec.structs import replace
 
-from agent.estimation.claim import CONDITIONS, Blocked, blocked, claim
+from agent.estimation.claim import CONDITIONS, Blocked, Condition, blocked, claim
 from agent.estimation.gaussian import pair
 from agent.estimation.judged import Judged, User
 from compose.launch.in_process import run_mission
@@ -22,13 +22,14 @@ def judged() -> Judged:
     """Return the estimate of a robot from which its claim has followed."""
     seen: list[Judged] = []
 
-    def remembered(one: Judged | None) -> Localised | Blocked:
-        assert one is not None
-        seen.append(one)
-        return claim(one)
+    def remembered(one: Judged | None, conditions: Sequence[Condition]) -> Blocked | None:
+        found = blocked(one, conditions)
+        if one is not None and found is None and conditions == CONDITIONS:
+            seen.append(one)
+        return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pair, "claim", remembered)
+        patch.setattr(pair, "blocked", remembered)
         run_mission(scenario_of(SIGMA, 4))
     return seen[-1]
 

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import pytest
 
 import tandem
-from agent.estimation.claim import Blocked, claim
+from agent.estimation.claim import Blocked, Condition, blocked
 from agent.estimation.claim import rivals as no_rivals
 from agent.estimation.gaussian import claim_rivals, pair
 from agent.estimation.judged import Judged
@@ -16,7 +17,6 @@ from agent.planning import active_sensing
 from agent.planning.assured import Assured
 from compose.launch.in_process import run_mission
 from compose.recording.summary_json import summary
-from protocol.messages import Localised
 from tests.groups import random_group
 from tests.series import series
 from tests.surveys import SIGMA, assert_localised, scenario_of
@@ -51,9 +51,9 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
 ) -> None:
     rivals, planned = [], []
 
-    def remembered(judged: Judged) -> Localised | Blocked:
-        found = claim(judged)
-        if isinstance(found, Blocked) and found.condition is no_rivals:
+    def remembered(judged: Judged | None, conditions: Sequence[Condition]) -> Blocked | None:
+        found = blocked(judged, conditions)
+        if judged is not None and found is not None and found.condition is no_rivals:
             rivals.append(judged.rival)
         return found
 
@@ -61,7 +61,7 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
         planned.append(hypotheses)
         return active_sensing.plan_together(hypotheses, *args)
 
-    monkeypatch.setattr(pair, "claim", remembered)
+    monkeypatch.setattr(pair, "blocked", remembered)
     monkeypatch.setattr(Assured, "joint_manoeuvres", lambda _, *args: plan_together(*args))
     assert_localised(run_mission(scenario_of(SIGMA, 382, reach=1.5)))
     assert rivals

@@ -135,6 +135,11 @@ class Knowledge(msgspec.Struct, frozen=True):
         moved = compose(inverse(self.belief.odometry), self.odometry)
         return tuple([compose(pose, moved) for pose in self.belief.poses])
 
+    @property
+    def known_through(self) -> int:
+        """Return the last tick that both logs cover, with the ranges to the anchors."""
+        return min(self.tick, self.peer_state.peer.through, self.peer_state.ranges_through)
+
     def seen(self) -> list[tuple[Pose, float | None]]:
         """Return the odometry pose of each tick of phase 1, and the anchor range or None.
 

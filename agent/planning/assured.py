@@ -18,6 +18,7 @@ from agent.planning import (
     phase2_orbit,
     phase2_pursuit,
     phase3_survey,
+    plausibility,
     tasks,
     turns,
 )
@@ -51,7 +52,7 @@ class Assured(LogPlanner):
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports` and with the task that follows from them."""
         if reports:
-            state = exchange.with_reports(state, reports)
+            state = plausibility.with_reports(state, reports)
         if not state.in_contact or isinstance(state.task, tasks.Done):
             return state
         match state.task:

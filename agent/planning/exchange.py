@@ -15,7 +15,6 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import (
     phase1_anchor,
     phase3_last_manoeuvre,
-    plausibility,
     range_seeking,
     separation,
     tasks,
@@ -27,13 +26,11 @@ from agent.planning.state import RobotState
 from protocol.messages import (
     Command,
     Estimate,
-    Inconsistent,
     Localised,
     Observation,
     Ranged,
     Report,
     RobotConfig,
-    Undecided,
     Verdict,
 )
 from protocol.mission import Mission
@@ -100,32 +97,6 @@ def report_without_log(state: RobotState, verdict: Verdict | None) -> Report:
         ranges_since=len(state.log.ranges),
         verdict=verdict,
     )
-
-
-def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
-    """Return `state` with the data of `reports`, and with a verdict if a report gives reason for one.
-
-    The verdict is Inconsistent if a report is implausible, and Undecided if the peer has given up.
-    """
-    for received in reports:
-        updated = peer_state.with_report(state.peer_state, received)
-        objection = (
-            plausibility.objection(
-                state.peer_state, updated, received, state.config, state.estimator.report_tolerance
-            )
-            if state.verdict is None
-            else None
-        )
-        state = replace(state, peer_state=updated)
-        if objection is not None:
-            return state.ended(objection)
-    if state.verdict is None:
-        match state.peer_state.verdict:
-            case Undecided(reason):
-                return state.undecided(f"{state.config.peer} reports: {reason}")
-            case Inconsistent(contradiction):
-                return state.undecided(f"{state.config.peer} found a contradiction: {contradiction}")
-    return state
 
 
 def command(state: RobotState, controls: Controls) -> Command:
@@ -198,28 +169,28 @@ class LogPlanner(Planner[RobotState, Report]):
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, and with the task that follows from them."""
         state, ranged = observed(state, observation), observation.anchor_range is not None
-        task, steps = state.task, self.steps(state)
+        task = state.task
         match task:  # in real time, a manoeuvre may not have been executed
             case tasks.Orbiting(None) | tasks.Resting() | tasks.Done():  # most ticks
                 return state
             case tasks.Orbital():
-                return steps.phase2(state, task, ranged)
+                return self.steps(state).phase2(state, task, ranged)
             case tasks.Searching(beacon):
                 measured = state.in_contact if beacon == "peer" else ranged
                 seeking = range_seeking.onward(state, task, measured, self.MANOEUVRES)
                 if seeking is not None:
                     return state.doing(seeking)
-                return (
-                    state.doing(tasks.Waiting()) if beacon == "peer" else steps.phase1(state, self.MANOEUVRES)
-                )
+                if beacon == "peer":
+                    return state.doing(tasks.Waiting())
+                return self.steps(state).phase1(state, self.MANOEUVRES)
             case tasks.ThirdPoint(_, origin) if state.odometry != origin:
-                return steps.phase1(state, self.MANOEUVRES)
+                return self.steps(state).phase1(state, self.MANOEUVRES)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
                 return turns.after_last_manoeuvre(state, task)
             case tasks.Asleep() if observation.anchor_range is not None:
                 return phase1_anchor.begun(state, observation.anchor_range)
             case tasks.Asleep():
-                return steps.unranged(state)
+                return self.steps(state).unranged(state)
             case _:
                 return self._sense(state, ranged)
 

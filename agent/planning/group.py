@@ -16,7 +16,16 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import appointments, confirmation, exchange, meetings, own_pose, searching, visit
+from agent.planning import (
+    appointments,
+    confirmation,
+    exchange,
+    meetings,
+    own_pose,
+    plausibility,
+    searching,
+    visit,
+)
 from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
 from agent.planning.planner import Planner, Summary
@@ -190,7 +199,7 @@ def _apart(state: RobotState, reports: Sequence[Report]) -> RobotState:
         state = meetings.with_sender(state, one)
         state = state.with_other(one.robot, acknowledged=one.heard)  # if overtaken, more is sent again
     of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
-    heard = exchange.with_reports(state, of_peer)
+    heard = plausibility.with_reports(state, of_peer)
     if heard.verdict == state.verdict:
         state = heard
     return meetings.onward(own_pose.updated(state)) if state.sweeps else state

@@ -6,6 +6,7 @@ from msgspec.structs import replace
 
 from agent.planning import drive
 from agent.planning.state import RobotState
+from agent.planning.strides import stride
 from agent.planning.tasks import Homing, Straight
 from protocol.motion import ORIGIN, Pose, inverse
 from protocol.team_motion import next_on_spiral
@@ -25,9 +26,9 @@ def onward(state: RobotState, task: Homing) -> RobotState:
     return state.doing(Homing(Pose(x, y, 0.0), task.side + 1))
 
 
-def ticks_without_range(state: RobotState) -> int:
-    """Return the number of ticks since the last anchor range."""
-    return state.tick - state.log.ranges[-1].tick
+def is_lost(state: RobotState, strides: int = LOST_AFTER) -> bool:
+    """Return whether the robot has had no range to its anchor for so many `strides`."""
+    return state.tick - state.log.ranges[-1].tick >= strides * stride(state.config.mission)
 
 
 def begun(state: RobotState) -> RobotState:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agent.planning import drive, exchange, phase1_anchor, phase2_orbit, turns
+from agent.planning import drive, exchange, phase1_anchor, phase2_orbit, plausibility, turns
 from agent.planning.exchange import LogPlanner, Steps
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
@@ -36,7 +36,7 @@ class Paper(LogPlanner):
         Phase 3 begins when both robots are on their orbits.
         """
         if reports:
-            state = exchange.with_reports(state, reports)
+            state = plausibility.with_reports(state, reports)
         if not state.in_contact:
             return state
         match state.task:

@@ -10,10 +10,9 @@ from agent.estimation.gaussian.mission_measurements import path_of
 from agent.estimation.gaussian.own_anchor import anchor_planning_hypotheses, followed, is_anchor_known
 from agent.planning import homing, phase2_pursuit
 from agent.planning.active_sensing import next_objective, plan_alone
-from agent.planning.homing import LOST_AFTER, ticks_without_range
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
-from agent.planning.strides import is_planning_tick, stride
+from agent.planning.strides import is_planning_tick
 from agent.planning.tasks import Homing, Straight, Surveying
 from protocol.messages import BranchKind
 
@@ -70,7 +69,7 @@ def continued(state: RobotState, manoeuvres: Manoeuvres | None = None) -> RobotS
     mission, found = state.config.mission, followed(state)
     if found is not None:
         state = replace(state, own_anchor=found)
-    if ticks_without_range(state) >= LOST_AFTER * stride(mission):
+    if homing.is_lost(state):
         return homing.begun(state)
     if found is None or _are_misleading(state):
         latest = state.log.ranges[-1]

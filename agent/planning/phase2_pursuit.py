@@ -9,7 +9,7 @@ from msgspec.structs import replace
 from agent.estimation.gaussian.own_anchor import anchor_planning_hypotheses, followed, is_fit_due
 from agent.planning import drive, homing, phase2_orbit
 from agent.planning.active_sensing import plan_alone
-from agent.planning.homing import LOST_AFTER, ticks_without_range
+from agent.planning.homing import LOST_AFTER
 from agent.planning.state import RobotState
 from agent.planning.strides import is_planning_tick, stride
 from agent.planning.tasks import Orbital, Orbiting, Radial
@@ -43,16 +43,15 @@ def continued(state: RobotState, task: Orbital, ranged: bool = False) -> RobotSt
     if orbit.v != 0.0 and mission.max_turn_rate * mission.period >= JOINING_TURN:
         task = task if isinstance(task, Orbiting) else Orbiting()
     task = phase2_orbit.onward(state, task)
-    timeout: float = LOST_AFTER * stride(mission)
-    if orbit.v == 0.0 and isinstance(task, Radial | Orbiting) and ticks_without_range(state) >= timeout:
+    if orbit.v == 0.0 and isinstance(task, Radial | Orbiting) and homing.is_lost(state):
         return homing.begun(state)
     if not isinstance(task, Orbiting):
         return state.doing(task)
     since = task.since or state.tick
     if orbit.v == 0.0:
         return state.doing(Orbiting(_while_waiting(state, task, planning, ranged), since))
-    timeout += (orbit.radius / mission.max_speed + state.config.rendezvous.bound) / mission.period
-    if state.tick - since > timeout and not state.in_contact:
+    search = (orbit.radius / mission.max_speed + state.config.rendezvous.bound) / mission.period
+    if state.tick - since > LOST_AFTER * stride(mission) + search and not state.in_contact:
         return homing.begun_again(state, state.start) if state.config.begins_again else homing.begun(state)
     return state.doing(Orbiting(drive.pursuit(state.local_pose, orbit, mission), since))
 

@@ -15,13 +15,11 @@ from agent.estimation.gaussian.mission_measurements import (
     MANY_MUTUAL_RANGES,
     has_failed,
     m2_of,
-    peer_log_suffices,
 )
 from agent.estimation.gaussian.pair import followed
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.planning import homing, phase2_pursuit, range_seeking
 from agent.planning.active_sensing import CONTINUED, next_objective, plan_together
-from agent.planning.homing import ticks_without_range
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
 from agent.planning.tasks import Listening, Retreating, Surveying
@@ -40,15 +38,15 @@ JointManoeuvres = Callable[
 
 def sensed(state: RobotState, task: Surveying | Listening | Retreating) -> RobotState:
     """Return `state` with the task that follows `task`: the peer, or b's anchor, may be out of range."""
-    ticks = stride(state.config.mission)
+    mission = state.config.mission
     match task:
-        case Retreating(_, since) if state.tick - since < 2 * ticks:
+        case Retreating(_, since) if state.tick - since < 2 * stride(mission):
             return state
         case Retreating() if state.in_contact:
             return state.doing(Surveying("peer", since=state.tick))
         case Retreating():
             return phase2_pursuit.begun(state)
-        case _ if state.config.role == "b" and ticks_without_range(state) >= LOST_AFTER_IN_PHASE_3 * ticks:
+        case _ if state.config.role == "b" and homing.is_lost(state, LOST_AFTER_IN_PHASE_3):
             return homing.begun(state)
         case _ if not state.in_contact:
             back = Controls(0.0 - task.command.v, 0.0 - task.command.omega)
@@ -64,7 +62,7 @@ def decided(state: RobotState, planned: JointManoeuvres) -> RobotState:
     """
     if state.peer_state.start is None:
         return state
-    if not peer_log_suffices(state):
+    if state.known_through < state.log.moved(state.config.mission.noise.standstill_bound):
         return state.doing(Listening())
     if state.belief.encounter_tick is None:
         state = replace(state, belief=replace(state.belief, encounter_tick=state.tick))

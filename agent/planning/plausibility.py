@@ -1,4 +1,4 @@
-"""Plausibility checks of a peer's reports: against its earlier reports, its limits and its own measurements.
+"""The reports of a peer, checked against its earlier ones, its limits and its own measurements.
 
 The mutual ranges are evaluated elsewhere: by the estimator (`Estimator.pair`).
 """
@@ -6,12 +6,16 @@ The mutual ranges are evaluated elsewhere: by the estimator (`Estimator.pair`).
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+
+from msgspec.structs import replace
 
 from agent.estimation.gaussian.odometry_noise import STRAY_DISTANCE, STRAY_TURN
 from agent.peer.motion_log import MotionLog
-from agent.peer.peer_state import PeerState
+from agent.peer.peer_state import PeerState, with_report
+from agent.planning.state import RobotState
 from agent.planning.tasks import Orbiting
-from protocol.messages import Inconsistent, Report, RobotConfig
+from protocol.messages import Inconsistent, Report, RobotConfig, Undecided
 from protocol.mission import Mission
 from protocol.motion import wrap
 
@@ -20,6 +24,27 @@ SPEED_SLACK = 1e-9
 
 NOISY = 6.0
 """The largest plausible noise of actuation and odometry, in standard deviations."""
+
+
+def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
+    """Return `state` with the data of `reports`, and with a verdict if a report gives reason for one.
+
+    The verdict is Inconsistent if a report is implausible, and Undecided if the peer has given up.
+    """
+    for received in reports:
+        before, state = state, replace(state, peer_state=with_report(state.peer_state, received))
+        if state.verdict is None:
+            tolerance = state.estimator.report_tolerance
+            found = objection(before.peer_state, state.peer_state, received, state.config, tolerance)
+            if found is not None:
+                return state.ended(found)
+    if state.verdict is None:
+        match state.peer_state.verdict:
+            case Undecided(reason):
+                return state.undecided(f"{state.config.peer} reports: {reason}")
+            case Inconsistent(contradiction):
+                return state.undecided(f"{state.config.peer} found a contradiction: {contradiction}")
+    return state
 
 
 def objection(

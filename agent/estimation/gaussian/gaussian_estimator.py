@@ -12,7 +12,7 @@ from agent.estimation.closed_forms import Placement
 from agent.estimation.estimator import AnchorEstimate, Estimator, PairEstimate
 from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit
-from agent.estimation.gaussian.mission_measurements import known_through, pair_of
+from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.gaussian.own_anchor import followed
 from agent.estimation.gaussian.pair import believed
 from agent.estimation.gaussian.search import search
@@ -73,14 +73,14 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
             return None
         measured = pair_of(knowledge)
         mutual = np.count_nonzero(measured.ranges.mutual)
-        if known_through(knowledge) < knowledge.tick or mutual < FEWEST_MUTUAL_RANGES:
+        if knowledge.known_through < knowledge.tick or mutual < FEWEST_MUTUAL_RANGES:
             return None
         found = search(measured, fewest=FEWEST_MUTUAL_RANGES)
-        belief, judged = believed(knowledge, "paper", found, measured)
+        belief, judged, blocking = believed(knowledge, "paper", found, measured)
         failure = f"the paper's manoeuvres give no further ranges: {belief.blocking_reason}"
-        verdict: Verdict | None = Undecided(failure) if judged is None else None
-        if judged is not None and belief.blocking_reason is None:
-            verdict = judged.localised
+        verdict: Verdict | None = Undecided(failure)
+        if judged is not None:
+            verdict = judged.localised if blocking is None else None
         placements = tuple([_pose_in_b_frame(one.fit) for one in belief.pair])
         return PairEstimate(belief, verdict, placements, failure)
 

@@ -119,23 +119,13 @@ def own_measurements(knowledge: Knowledge) -> JointMeasurements:
     return replace(own.alone(0), solver=knowledge.solver)
 
 
-def known_through(knowledge: Knowledge) -> int:
-    """Return the last tick that both logs cover."""
-    return min(knowledge.tick, knowledge.peer_state.peer.through, knowledge.peer_state.ranges_through)
-
-
-def peer_log_suffices(knowledge: Knowledge) -> bool:
-    """Return whether the peer's log reaches the tick of this robot's last motion."""
-    return known_through(knowledge) >= knowledge.log.moved(knowledge.config.mission.noise.standstill_bound)
-
-
 def pair_of(knowledge: Knowledge) -> JointMeasurements:
     """Return the ranges and odometry of both robots; the first is robot a, and M1 is the origin.
 
     The own data reach up to now, and the peer's up to the last tick that both logs cover.
     """
     peer, config = knowledge.peer_state.peer, knowledge.config
-    mission, last = config.mission, known_through(knowledge)
+    mission, last = config.mission, knowledge.known_through
     logs, ends = ((knowledge.log, peer), (knowledge.tick, last, last))
     if config.role == "b":
         logs, ends = ((peer, knowledge.log), (last, knowledge.tick, last))

@@ -8,25 +8,10 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.claim import (
-    BEFORE_SEARCH,
-    CONDITIONS,
-    Condition,
-    blocked,
-    claim,
-    early_consistency,
-    profiles,
-    rivals,
-)
+from agent.estimation.claim import BEFORE_SEARCH, CONDITIONS, Blocked, Condition, blocked, profiles, rivals
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES, rejecting_p_value
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.mission_measurements import (
-    beginning,
-    known_through,
-    m2_of,
-    own_measurements,
-    pair_of,
-)
+from agent.estimation.gaussian.mission_measurements import beginning, m2_of, own_measurements, pair_of
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, doubt
 from agent.estimation.gaussian.planning_hypotheses import (
     PlanningHypothesis,
@@ -66,20 +51,21 @@ def followed(knowledge: Knowledge) -> FollowedPair:
     The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit does not
     converge, and before a claim or a suspicion.
     """
-    measured, belief = pair_of(knowledge), _of_this_attempt(knowledge)
+    first = beginning(knowledge, knowledge.known_through)
+    if first != knowledge.belief.beginning:
+        knowledge = replace(knowledge, belief=_begun_again(knowledge.belief, first))
+    measured, belief = pair_of(knowledge), knowledge.belief
     mutual = int(np.count_nonzero(measured.ranges.mutual))
     if mutual < FEWEST_FOR_CLAIM:
         return FollowedPair(measured, belief)
-    knowledge = replace(knowledge, belief=belief)
     known = settled(Posterior(PAIR, belief.pair), measured)
     due = any(belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
     if known.hypotheses and known.has_converged and not due:
-        belief, _ = believed(knowledge, "assured", known, measured, BEFORE_SEARCH)
+        belief, _, blocking = believed(knowledge, "assured", known, measured, BEFORE_SEARCH)
         test = belief.inconsistency
-        if belief.blocking_reason is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
-            return FollowedPair(measured, belief, tuple([planning_hypothesis(one) for one in belief.pair]))
-    belief, judged = believed(knowledge, "assured", search(measured, known), measured, BEFORE_SEARCH)
-    return _searched(knowledge, measured, replace(belief, ranges_at_last_search=mutual), judged)
+        if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
+            return FollowedPair(measured, belief, tuple(map(planning_hypothesis, belief.pair)))
+    return _searched(knowledge, measured, search(measured, known), mutual)
 
 
 def believed(
@@ -88,21 +74,21 @@ def believed(
     found: Posterior,
     measured: JointMeasurements,
     conditions: Sequence[Condition] = CONDITIONS,
-) -> tuple[Belief, Judged | None]:
-    """Return the belief with the hypotheses `found`, and the first one as the conditions of a claim see it.
+) -> tuple[Belief, Judged | None, Blocked | None]:
+    """Return the belief with the hypotheses `found`, the first one as a claim sees it, and what blocks that.
 
-    The belief has the first of the `conditions` that blocks the claim of `user`.
+    The claim is that of `user`, and the last is the first of the `conditions` that is not met.
     """
     config, scored = knowledge.config, found.hypotheses
-    judged = of_pair(user, config, scored, measured)
-    if judged is not None and user == "assured" and not isinstance(knowledge.peer_state.verdict, Localised):
-        judged = judged._replace(rivals_of=(0, 1))
-    blocking = blocked(judged, conditions)
     robot, m1 = 0 if config.role == "a" else 1, config.m1
     claims = [
         localised(to_second_order(one, m2_of(config)), robot, (m1.x, m1.y))
         for one in map(planning_hypothesis, scored)
     ]
+    judged = of_pair(user, config, scored, measured)
+    if judged is not None and user == "assured" and not isinstance(knowledge.peer_state.verdict, Localised):
+        judged = judged._replace(rivals_of=(0, 1))
+    blocking = blocked(judged, conditions)
     first, _ = knowledge.belief.candidates or (len(scored), 0)
     belief = replace(
         knowledge.belief,
@@ -114,16 +100,13 @@ def believed(
         inconsistency=judged and judged.inconsistency,
         blocking_reason=blocking and blocking.reason,
     )
-    return belief, judged
+    return belief, judged, blocking
 
 
-def _of_this_attempt(knowledge: Knowledge) -> Belief:
-    """Return the belief without the hypotheses and tests of an attempt before a last began again."""
-    first = beginning(knowledge, known_through(knowledge))
-    if first == knowledge.belief.beginning:
-        return knowledge.belief
+def _begun_again(belief: Belief, first: int) -> Belief:
+    """Return `belief` without the hypotheses and tests of an attempt before a began again at tick `first`."""
     return replace(
-        knowledge.belief,
+        belief,
         beginning=first,
         pair=(),
         candidates=None,
@@ -137,17 +120,19 @@ def _of_this_attempt(knowledge: Knowledge) -> Belief:
 
 
 def _searched(
-    knowledge: Knowledge, measured: JointMeasurements, belief: Belief, judged: Judged | None
+    knowledge: Knowledge, measured: JointMeasurements, found: Posterior, mutual: int
 ) -> FollowedPair:
-    """Return the estimate after a search of the plane: with a verdict, or with the reason against a claim.
+    """Return the estimate by the hypotheses that a search has `found` with so many `mutual` ranges.
 
     After INCONSISTENT_SEARCHES consecutive failures of the consistency test, the verdict is Inconsistent, or
     Undecided if the robot's own sensors are not as it was told. It is also Undecided if other profiles of the
     sensors contradict all of its latest claims: then more ranges have not helped.
     """
-    hypotheses, test = tuple([planning_hypothesis(one) for one in belief.pair]), belief.inconsistency
+    belief, judged, blocking = believed(knowledge, "assured", found, measured)
+    hypotheses, test = tuple(map(planning_hypothesis, belief.pair)), belief.inconsistency
     p_values = [belief.p_value, test.p_value if test is not None else None]
     least = min([one for one in p_values if one is not None], default=None)
+    belief = replace(belief, ranges_at_last_search=mutual)
     if test is not None and len(measured.mutual_places) >= sufficient_mutual_ranges(measured.noise):
         failed = test.p_value < rejecting_p_value(measured.noise)
         failures = belief.inconsistent_searches + 1 if failed else 0
@@ -155,18 +140,17 @@ def _searched(
         if failures >= INCONSISTENT_SEARCHES:
             own = own_measurements(knowledge).thinned_after()
             doubted = doubt(own, measured, 0 if knowledge.config.role == "a" else 1)
-            contradiction = test if doubted is None else Undecided(doubted.reason())
-            return FollowedPair(measured, belief, hypotheses, contradiction)
-    if belief.blocking_reason is not None:
-        return FollowedPair(measured, belief, hypotheses)
-    found = claim(judged)
-    if isinstance(found, Localised):
-        return FollowedPair(measured, replace(belief, doubtful_claims=0, p_value=least), hypotheses, found)
-    doubtful = belief.doubtful_claims + (found.condition is profiles)
-    if found.condition not in (early_consistency, profiles):
-        doubtful = 0
-    if judged is not None and found.condition is rivals:
-        hypotheses = (hypotheses[0], judged.rival.hypothesis, *hypotheses[1:])
-    belief = replace(belief, blocking_reason=found.reason, doubtful_claims=doubtful)
-    verdict = Undecided(found.reason) if doubtful >= DOUBTFUL_CLAIMS else None
-    return FollowedPair(measured, belief, hypotheses, verdict)
+            verdict = test if doubted is None else Undecided(doubted.reason())
+            return FollowedPair(measured, belief, hypotheses, verdict)
+    if judged is None:
+        return FollowedPair(measured, belief)
+    if blocking is None:
+        belief = replace(belief, doubtful_claims=0, p_value=least)
+        return FollowedPair(measured, belief, hypotheses, judged.localised)
+    doubtful = belief.doubtful_claims
+    if blocking.condition is profiles:
+        doubtful += 1
+    elif blocking.condition is rivals:
+        doubtful, hypotheses = 0, (hypotheses[0], judged.rival.hypothesis, *hypotheses[1:])
+    undecided = Undecided(blocking.reason) if doubtful >= DOUBTFUL_CLAIMS else None
+    return FollowedPair(measured, replace(belief, doubtful_claims=doubtful), hypotheses, undecided)
