@@ -148,8 +148,8 @@ def of_pair(
         return None
     mission, role = config.mission, config.role
     robot, ids = (0, (config.robot, config.peer)) if role == "a" else (1, (config.peer, config.robot))
-    places = len(pair.mutual_places)
     required = required_mutual_ranges(mission.noise) if user in FIRST_CLAIMS else 0
+    places = len(pair.mutual_places)
     own_heading = config.heading_accuracy if places < ENOUGH_FOR_HEADING else HEADING_ACCURACY
     best = scored[0]
     return Judged(

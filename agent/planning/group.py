@@ -24,6 +24,7 @@ from agent.planning import (
     own_pose,
     plausibility,
     searching,
+    sweep,
     visit,
 )
 from agent.planning.exchange import LogPlanner
@@ -89,7 +90,7 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        noisy = searching.reports_covariance(state)
+        noisy = sweep.reports_covariance(state)
         if noisy and searching.is_helped(state, peer):
             return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):

@@ -28,14 +28,14 @@ IN_RANGE_SIGMAS = 3.0
 
 
 def third_point(
-    places: Sequence[Pose],
+    poses: Sequence[Pose],
     mission: Mission,
     manoeuvres: Manoeuvres,
     *,
     margin: float = RANGE_MARGIN,
     pinning: bool = False,
 ) -> Controls | None:
-    """Return the manoeuvre whose end point best distinguishes the poses `places` in the anchor's frame.
+    """Return the manoeuvre whose end point best distinguishes `poses` in the anchor's frame.
 
     If the branches mirror each other along the heading, eq. (4) gives the best turn rate. If they mirror each
     other across it, as after a circle, driving straight is best. Both are compared, each with the longest
@@ -55,19 +55,19 @@ def third_point(
     turn_rate = third_point_turn_rate(mission)
     turn_rates = [side * turn_rate for side in manoeuvres.sides]
     # A single branch was found on a radius. A straight manoeuvre along that radius would check nothing.
-    if len(places) > 1 or pinning:
+    if len(poses) > 1 or pinning:
         turn_rates.append(0.0)
     for omega in turn_rates:
         unit = chord(1.0, omega, mission.period)
         longest = mission.max_speed * unit
         half = 0.5 * mission.period * omega
         for forward in manoeuvres.directions:
-            outward = [_outward(place, half, forward) for place in places]
+            outward = [_outward(pose, half, forward) for pose in poses]
             reach = max(_reach(along, across, rim) for along, across in outward)
             length = min(longest, reach)
             if pinning:
                 value = max(
-                    [abs(place.y + forward * length * math.sin(place.heading + half)) for place in places]
+                    [abs(pose.y + forward * length * math.sin(pose.heading + half)) for pose in poses]
                 )
             else:
                 value = _separation(length, [along for along, _ in outward])
@@ -76,11 +76,11 @@ def third_point(
     return best
 
 
-def _outward(place: Pose, half_turn: float, forward: float) -> tuple[float, float]:
+def _outward(pose: Pose, half_turn: float, forward: float) -> tuple[float, float]:
     """Return the components in m of the position, relative to the anchor, along and across the next chord."""
-    course = place.heading + half_turn
+    course = pose.heading + half_turn
     c, s = forward * math.cos(course), forward * math.sin(course)
-    return rotated_back(c, s, place.x, place.y)
+    return rotated_back(c, s, pose.x, pose.y)
 
 
 def _reach(along: float, across: float, rim: float) -> float:
@@ -172,8 +172,8 @@ def _to_third_point(
     """Plan the manoeuvre to the next measurement point of phase 1 (see `third_point`)."""
     if not estimate.branches:
         return state.undecided("no pose explains the anchor ranges")
-    places = local(estimate.branches, state.odometry)
-    command = third_point(places, state.config.mission, manoeuvres, margin=estimate.margin, pinning=pinning)
+    poses = local(estimate.branches, state.odometry)
+    command = third_point(poses, state.config.mission, manoeuvres, margin=estimate.margin, pinning=pinning)
     if command is None:
         return state.undecided("eq. (5) allows no manoeuvre to a third range")
     return state.doing(tasks.ThirdPoint(estimate.branches, state.odometry, command))

@@ -48,18 +48,13 @@ def is_helped(state: RobotState, robot: str) -> bool:
     return robot in state.config.unanchored and not finished
 
 
-def reports_covariance(state: RobotState) -> bool:
-    """Return whether robots without an anchor need the covariance of the pose that this one reports."""
-    return bool(state.config.unanchored) and state.estimator.corrects_poses
-
-
 def is_apart(state: RobotState) -> bool:
     """Return whether the robot is in no meeting any more: it sweeps, or is the beacon of one that does.
 
     A beacon stays where it is: it sweeps no part, and its planned meetings are over.
     """
     config, agenda = state.config, state.agenda
-    if not reports_covariance(state):
+    if not sweep.reports_covariance(state):
         return False
     assert config.sweep is not None
     if state.sweeps or config.part < config.sweep.parts or agenda.visits < len(config.visits):
@@ -77,7 +72,7 @@ def outside_meeting(state: RobotState, peer: str) -> Report:
     report = replace(exchange.report_without_log(state, agenda.robot_verdict), strips=sweep.strips(state))
     if not (is_helped(state, peer) and isinstance(agenda.robot_verdict, Localised)):
         return report
-    if not reports_covariance(state):
+    if not sweep.reports_covariance(state):
         return replace(report, prior=ReportedPose(state.tick, exchange.reported_pose(state, agenda.frame)))
     reference = agenda.own_pose.reference
     if reference is None:
@@ -98,7 +93,7 @@ def next_part(state: RobotState) -> RobotState:
         state = state.with_other(robot, failed=False)
     part = (config.part + state.agenda.parts) % config.sweep.parts
     state = state.with_agenda(part_tick=state.tick, visiting=False, unmet=0, silence=0)
-    if not reports_covariance(state):
+    if not sweep.reports_covariance(state):
         return sweep.along(state, config.sweep.strips_of(part, config.mission.sensing_range))
     state = state.with_agenda(parts=state.agenda.parts + 1)
     if config.part >= config.sweep.parts:
@@ -133,7 +128,7 @@ def swept(state: RobotState) -> RobotState:
     well enough; its verdict is Undecided if that contradicts its claim.
     """
     mission, odometry, helped = state.config.mission, state.odometry, _helped(state)
-    if reports_covariance(state):
+    if sweep.reports_covariance(state):
         state = _with_contact(state, helped)
         if state.verdict is not None:
             return state

@@ -49,13 +49,18 @@ def onward(
     return task
 
 
+def reports_covariance(state: RobotState) -> bool:
+    """Return whether robots without an anchor need the covariance of a pose that is reported to them."""
+    return bool(state.config.unanchored) and state.estimator.corrects_poses
+
+
 def shares(state: RobotState) -> bool:
     """Return whether robots that were found search with those that have found them.
 
     With noisy sensors they cannot, because they have no anchor and no beacon that correct their odometry. If
     robots may report false data, their poses are not independent of those that have found them.
     """
-    return not (state.estimator.corrects_poses or state.config.tolerates)
+    return not (reports_covariance(state) or state.config.tolerates)
 
 
 def strips(state: RobotState) -> tuple[int, int] | None:

@@ -37,7 +37,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
         state = RobotState(config, task=Awaiting())
-        if not state.estimator.corrects_poses:
+        if not sweep.reports_covariance(state):
             return state.with_agenda(found=Resected())
         library()  # it is needed when the robot is found, and would end the mission then
         return state.with_agenda(found=Contacted())

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from bisect import bisect_left
+from collections.abc import Sequence
 from functools import lru_cache
 from itertools import pairwise
 from operator import attrgetter
@@ -15,7 +16,7 @@ from agent.estimation.gaussian.measured_rows import Listed, near_anchors
 from agent.estimation.gaussian.odometry_noise import Places, Track, track, variances
 from agent.estimation.knowledge import Knowledge
 from agent.peer.motion_log import MotionLog
-from protocol.messages import RobotConfig
+from protocol.messages import Ranged, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import Segment
 from protocol.noise import VelocityNoise
@@ -92,29 +93,24 @@ def _path_of(
     return path._replace(extra=extra)
 
 
-def _missing(ranges: Listed, end: int, first: int) -> Places:
-    """Return the ticks from `first` on and before `end` without one of `ranges`."""
-    silent = np.ones(end, bool)
+def _within(ranges: Sequence[Ranged], first: int, through: int) -> tuple[Listed, Places]:
+    """Return tick and range in m of each of `ranges` in the ticks [first, through], and those without one."""
+    listed = [(one.tick, one.range) for one in ranges if first <= one.tick <= through]
+    silent = np.ones(through + 1, bool)
     silent[:first] = False
-    silent[[tick for tick, _ in ranges]] = False
-    return np.flatnonzero(silent)
-
-
-def _ranges_within(log: MotionLog, first: int, through: int) -> list[tuple[int, float]]:
-    """Return tick and range in m of each anchor range of `log` over the ticks [first, through]."""
-    return [(ranged.tick, ranged.range) for ranged in log.ranges if first <= ranged.tick <= through]
+    silent[[tick for tick, _ in listed]] = False
+    return listed, np.flatnonzero(silent)
 
 
 def own_measurements(knowledge: Knowledge) -> JointMeasurements:
     """Return the odometry of the robot and its ranges to its anchor, without those that do not count."""
     mission, now = knowledge.config.mission, knowledge.tick
     first = beginning(knowledge, now) if knowledge.config.role == "a" else 0
-    ranges = _ranges_within(knowledge.log, first, now)
-    silent = Silence(0, -1, _missing(ranges, now + 1, first))
+    ranges, silent = _within(knowledge.log.ranges, first, now)
     own = near_anchors(
         [path_of(knowledge.log, first, now, mission)],
         *([ranges], [(0.0, 0.0)], mission.noise, mission.sensing_range),
-        silent=(silent,),
+        silent=(Silence(0, -1, silent),),
     )
     return replace(own.alone(0), solver=knowledge.solver)
 
@@ -126,22 +122,17 @@ def pair_of(knowledge: Knowledge) -> JointMeasurements:
     """
     peer, config = knowledge.peer_state.peer, knowledge.config
     mission, last = config.mission, knowledge.known_through
-    logs, ends = ((knowledge.log, peer), (knowledge.tick, last, last))
-    if config.role == "b":
-        logs, ends = ((peer, knowledge.log), (last, knowledge.tick, last))
     first = beginning(knowledge, last)
-    firsts = (first, 0, first)
-    own = [_ranges_within(log, *within) for log, *within in zip(logs, firsts, ends, strict=False)]
-    mutual = [(one.tick, one.range) for one in knowledge.mutual if first <= one.tick <= last]
-    silent = [
-        Silence(*robots, _missing(ranges, end + 1, begin))
-        for robots, ranges, end, begin in zip(
-            ((0, -1), (1, -1), (0, 1)), (*own, mutual), ends, firsts, strict=True
-        )
-    ]
+    (a, a_end), (b, b_end) = (knowledge.log, knowledge.tick), (peer, last)
+    if config.role == "b":
+        (a, a_end), (b, b_end) = (b, b_end), (a, a_end)
+    of_a, a_silent = _within(a.ranges, first, a_end)
+    of_b, b_silent = _within(b.ranges, 0, b_end)
+    mutual, both_silent = _within(knowledge.mutual, first, last)
     measured = near_anchors(
-        (path_of(logs[0], first, ends[0], mission), path_of(logs[1], 0, ends[1], mission)),
-        *(own, ((0.0, 0.0), m2_of(config)), mission.noise, mission.sensing_range, mutual, tuple(silent)),
+        (path_of(a, first, a_end, mission), path_of(b, 0, b_end, mission)),
+        *((of_a, of_b), ((0.0, 0.0), m2_of(config)), mission.noise, mission.sensing_range, mutual),
+        silent=(Silence(0, -1, a_silent), Silence(1, -1, b_silent), Silence(0, 1, both_silent)),
     )
     return replace(measured.thinned(mission.sensing_range), solver=knowledge.solver)
 
