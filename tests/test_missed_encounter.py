@@ -123,11 +123,17 @@ def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:
 
     played(unsettled(UNSETTLED[0]), {}, planner_of=lambda _: Watched())
     for beliefs in known.values():
-        again = [now for before, now in pairwise(beliefs) if now.beginning != before.beginning]
+        again = [
+            now for before, now in pairwise(beliefs) if now.attempt.beginning != before.attempt.beginning
+        ]
         assert len(again) == 1
-        assert (again[0].pair, again[0].ranges_at_last_search, again[0].p_value) == ((), 0, None)
+        assert (again[0].pair, again[0].attempt.ranges_at_last_search, again[0].attempt.p_value) == (
+            (),
+            0,
+            None,
+        )
         assert beliefs[-1].pair, "the second meeting gives new ones"
-    assert known["a"][-1].beginning == known["b"][-1].beginning > 60
+    assert known["a"][-1].attempt.beginning == known["b"][-1].attempt.beginning > 60
 
 
 # --- what a measured before it began again -------------------------------------------------------------

@@ -13,7 +13,7 @@ from agent.estimation.solver import Solver
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from protocol import messages
-from protocol.messages import Inconsistent, Ranged, RobotConfig
+from protocol.messages import Ranged, RobotConfig
 from protocol.motion import ORIGIN, Covariance, Pose, compose, inverse
 from protocol.orbits import Orbit
 
@@ -37,6 +37,23 @@ class OwnAnchor(msgspec.Struct, frozen=True):
     """The branch that corresponds to each of them."""
     ranges_at_last_fit: int = 0
     """Noisy sensors: the number of anchor ranges at their latest fit."""
+
+
+class Attempt(msgspec.Struct, frozen=True):
+    """The searches and the returns of a robot with noisy sensors since a last began again in a meeting."""
+
+    beginning: int = 0
+    """The tick from which on the measurements of a count in `Belief.pair` (see `beginning`)."""
+    ranges_at_last_search: int = 0
+    """The number of mutual ranges at the latest search of the whole plane for hypotheses."""
+    p_value: float | None = None
+    """The smallest p-value of all searches of the whole plane, and of the claim."""
+    inconsistent_searches: int = 0
+    """The number of consecutive searches whose consistency test failed."""
+    doubtful_claims: int = 0
+    """The number of consecutive claims withheld because a profile contradicts them."""
+    returns: int = 0
+    """The number of times that the robot drove back to its anchor."""
 
 
 class Belief(msgspec.Struct, frozen=True):
@@ -69,20 +86,8 @@ class Belief(msgspec.Struct, frozen=True):
     """The covariance of the first pose in `poses`."""
     blocking_reason: str | None = None
     """Noisy sensors: the condition that still prevents a claim; None if every condition is met."""
-    beginning: int = 0
-    """Noisy sensors: the tick from which on the measurements of a count in `pair` (see `beginning`)."""
-    ranges_at_last_search: int = 0
-    """Noisy sensors: the number of mutual ranges at the latest search of the whole plane for hypotheses."""
-    inconsistency: Inconsistent | None = None
-    """Noisy sensors: the result of the consistency test of the most probable hypothesis."""
-    p_value: float | None = None
-    """Noisy sensors: the smallest p-value of all searches of the whole plane, and of the claim."""
-    inconsistent_searches: int = 0
-    """Noisy sensors: the number of consecutive searches whose consistency test failed."""
-    doubtful_claims: int = 0
-    """Noisy sensors: the number of consecutive claims withheld because a profile contradicts them."""
-    returns: int = 0
-    """Noisy sensors: the number of times that the robot drove back to its anchor."""
+    attempt: Attempt = Attempt()
+    """Noisy sensors: the searches for `pair`."""
     earlier_ranges: int = 0
     """Noisy sensors: the number of mutual ranges with the peer before this meeting (groups)."""
 

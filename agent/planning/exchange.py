@@ -281,7 +281,7 @@ class LogPlanner(Planner[RobotState, Report]):
             hypotheses=(len(belief.pair or belief.placements) if belief.candidates is not None else None),
             probability=belief.pair[0].probability if belief.pair else None,
             blocking_reason=belief.blocking_reason,
-            p_value=belief.p_value,
+            p_value=belief.attempt.p_value,
         )
 
     def misreport(self, body: Report, observations: Sequence[Observation]) -> str | None:

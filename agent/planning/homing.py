@@ -36,7 +36,8 @@ def begun(state: RobotState) -> RobotState:
     last_range_tick = state.log.ranges[-1].tick
     place = state.log.pose(ORIGIN, last_range_tick, state.config.mission.period)
     own_anchor = replace(state.own_anchor, hypotheses=())
-    belief = replace(state.belief, encounter_tick=None, pair=(), returns=state.belief.returns + 1)
+    attempt = replace(state.belief.attempt, returns=state.belief.attempt.returns + 1)
+    belief = replace(state.belief, encounter_tick=None, pair=(), attempt=attempt)
     return replace(state, task=Homing(place), own_anchor=own_anchor, belief=belief)
 
 

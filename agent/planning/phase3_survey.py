@@ -86,7 +86,7 @@ def decided(state: RobotState, planned: JointManoeuvres) -> RobotState:
 
 def _measures_in_vain(state: RobotState, pair: JointMeasurements) -> bool:
     """Return whether this meeting has so many ranges that more will hardly settle the poses."""
-    many = MANY_MUTUAL_RANGES * (1 + state.belief.returns)
+    many = MANY_MUTUAL_RANGES * (1 + state.belief.attempt.returns)
     return len(pair.mutual_places) >= many and len(state.mutual) - state.belief.earlier_ranges >= many
 
 

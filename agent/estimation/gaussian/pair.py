@@ -21,7 +21,7 @@ from agent.estimation.gaussian.planning_hypotheses import (
 )
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, User, of_pair, sufficient_mutual_ranges
-from agent.estimation.knowledge import Belief, Knowledge
+from agent.estimation.knowledge import Attempt, Belief, Knowledge
 from agent.estimation.posterior import PAIR, Posterior, settled
 from protocol.messages import Localised, Undecided, Verdict
 
@@ -52,17 +52,18 @@ def followed(knowledge: Knowledge) -> FollowedPair:
     converge, and before a claim or a suspicion.
     """
     first = beginning(knowledge, knowledge.known_through)
-    if first != knowledge.belief.beginning:
-        knowledge = replace(knowledge, belief=_begun_again(knowledge.belief, first))
     measured, belief = pair_of(knowledge), knowledge.belief
+    if first != belief.attempt.beginning:
+        belief = replace(belief, pair=(), candidates=None, attempt=Attempt(first))
+        knowledge = replace(knowledge, belief=belief)
     mutual = int(np.count_nonzero(measured.ranges.mutual))
     if mutual < FEWEST_FOR_CLAIM:
         return FollowedPair(measured, belief)
     known = settled(Posterior(PAIR, belief.pair), measured)
-    due = any(belief.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
+    due = any(belief.attempt.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
     if known.hypotheses and known.has_converged and not due:
-        belief, _, blocking = believed(knowledge, "assured", known, measured, BEFORE_SEARCH)
-        test = belief.inconsistency
+        belief, judged, blocking = believed(knowledge, "assured", known, measured, BEFORE_SEARCH)
+        test = judged and judged.inconsistency
         if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
             return FollowedPair(measured, belief, tuple(map(planning_hypothesis, belief.pair)))
     return _searched(knowledge, measured, search(measured, known), mutual)
@@ -97,26 +98,9 @@ def believed(
         odometry=knowledge.odometry,
         covariance=claims[0].covariance if claims else None,
         candidates=(first, len(scored)),
-        inconsistency=judged and judged.inconsistency,
         blocking_reason=blocking and blocking.reason,
     )
     return belief, judged, blocking
-
-
-def _begun_again(belief: Belief, first: int) -> Belief:
-    """Return `belief` without the hypotheses and tests of an attempt before a began again at tick `first`."""
-    return replace(
-        belief,
-        beginning=first,
-        pair=(),
-        candidates=None,
-        ranges_at_last_search=0,
-        inconsistency=None,
-        p_value=None,
-        inconsistent_searches=0,
-        doubtful_claims=0,
-        returns=0,
-    )
 
 
 def _searched(
@@ -129,28 +113,29 @@ def _searched(
     sensors contradict all of its latest claims: then more ranges have not helped.
     """
     belief, judged, blocking = believed(knowledge, "assured", found, measured)
-    hypotheses, test = tuple(map(planning_hypothesis, belief.pair)), belief.inconsistency
-    p_values = [belief.p_value, test.p_value if test is not None else None]
+    hypotheses, test = tuple(map(planning_hypothesis, belief.pair)), judged and judged.inconsistency
+    attempt = replace(belief.attempt, ranges_at_last_search=mutual)
+    p_values = [attempt.p_value, test.p_value if test is not None else None]
     least = min([one for one in p_values if one is not None], default=None)
-    belief = replace(belief, ranges_at_last_search=mutual)
+    verdict: Verdict | None = None
     if test is not None and len(measured.mutual_places) >= sufficient_mutual_ranges(measured.noise):
         failed = test.p_value < rejecting_p_value(measured.noise)
-        failures = belief.inconsistent_searches + 1 if failed else 0
-        belief = replace(belief, inconsistent_searches=failures, p_value=least)
+        failures = attempt.inconsistent_searches + 1 if failed else 0
+        attempt = replace(attempt, inconsistent_searches=failures, p_value=least)
         if failures >= INCONSISTENT_SEARCHES:
             own = own_measurements(knowledge).thinned_after()
             doubted = doubt(own, measured, 0 if knowledge.config.role == "a" else 1)
             verdict = test if doubted is None else Undecided(doubted.reason())
-            return FollowedPair(measured, belief, hypotheses, verdict)
-    if judged is None:
-        return FollowedPair(measured, belief)
-    if blocking is None:
-        belief = replace(belief, doubtful_claims=0, p_value=least)
-        return FollowedPair(measured, belief, hypotheses, judged.localised)
-    doubtful = belief.doubtful_claims
-    if blocking.condition is profiles:
-        doubtful += 1
-    elif blocking.condition is rivals:
-        doubtful, hypotheses = 0, (hypotheses[0], judged.rival.hypothesis, *hypotheses[1:])
-    undecided = Undecided(blocking.reason) if doubtful >= DOUBTFUL_CLAIMS else None
-    return FollowedPair(measured, replace(belief, doubtful_claims=doubtful), hypotheses, undecided)
+    match blocking:
+        case _ if judged is None or verdict is not None:
+            pass
+        case None:
+            attempt = replace(attempt, doubtful_claims=0, p_value=least)
+            verdict = judged.localised
+        case Blocked(condition, reason) if condition is profiles:
+            attempt = replace(attempt, doubtful_claims=attempt.doubtful_claims + 1)
+            verdict = Undecided(reason) if attempt.doubtful_claims >= DOUBTFUL_CLAIMS else None
+        case Blocked(condition) if condition is rivals:
+            attempt = replace(attempt, doubtful_claims=0)
+            hypotheses = (hypotheses[0], judged.rival.hypothesis, *hypotheses[1:])
+    return FollowedPair(measured, replace(belief, attempt=attempt), hypotheses, verdict)
