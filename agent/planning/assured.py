@@ -18,9 +18,9 @@ from agent.planning import (
     phase2_orbit,
     phase2_pursuit,
     phase3_survey,
+    phase3_turns,
     plausibility,
     tasks,
-    turns,
 )
 from agent.planning.drive import controls
 from agent.planning.exchange import LogPlanner, Steps
@@ -41,7 +41,7 @@ class Assured(LogPlanner):
     )
     """Both ways, to both sides in phase 1, and at several speeds."""
     DEAD_RECKONED = Steps(
-        phase1_anchor.unranged, phase1_anchor.until_accurate, phase2_orbit.continued, turns.met
+        phase1_anchor.unranged, phase1_anchor.until_accurate, phase2_orbit.continued, phase3_turns.met
     )
     """The paper's steps, with more manoeuvres to choose from."""
     CORRECTED = Steps(
@@ -59,7 +59,7 @@ class Assured(LogPlanner):
             case tasks.Orbital() | tasks.Travelling():
                 return self.steps(state).phase3(state, self.joint_manoeuvres)
             case tasks.Resting():
-                return turns.decided(state, self.last_manoeuvre)
+                return phase3_turns.decided(state, self.last_manoeuvre)
             case tasks.Listening() | tasks.Surveying("peer") if is_planning_tick(state):
                 return phase3_survey.decided(state, self.joint_manoeuvres)
             case _:

@@ -15,10 +15,10 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import (
     phase1_anchor,
     phase3_last_manoeuvre,
+    phase3_turns,
     range_seeking,
     separation,
     tasks,
-    turns,
 )
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres, Planner, Summary
@@ -186,7 +186,7 @@ class LogPlanner(Planner[RobotState, Report]):
             case tasks.ThirdPoint(_, origin) if state.odometry != origin:
                 return self.steps(state).phase1(state, self.MANOEUVRES)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
-                return turns.after_last_manoeuvre(state, task)
+                return phase3_turns.after_last_manoeuvre(state, task)
             case tasks.Asleep() if observation.anchor_range is not None:
                 return phase1_anchor.begun(state, observation.anchor_range)
             case tasks.Asleep():
