@@ -260,6 +260,7 @@ def test_a_search_keeps_what_is_known_too(monkeypatch: pytest.MonkeyPatch) -> No
     pair, _ = after_a_long_way(0)
     held = search(pair)
     monkeypatch.setattr(searching, "placements", lambda *_: [])
+    searching.from_nothing.cache_clear()
     again = search.__wrapped__(pair, held)
     assert len(again.hypotheses) == len(held.hypotheses)
     assert again.hypotheses[0].fit.guess == pytest.approx(held.hypotheses[0].fit.guess, abs=1e-3)

@@ -13,7 +13,14 @@ from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, parts, p
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, displacements
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.search import begun, candidates, extended, search
+from agent.estimation.gaussian.search import (
+    FEWEST_DECISIVE,
+    begun,
+    candidates,
+    extended,
+    from_nothing,
+    search,
+)
 from agent.estimation.judged import Judged, User, misfit, of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, carried, certainties, ended, settled
 
@@ -150,7 +157,9 @@ class Following(NamedTuple):
         left = [one for one in possible if one.decisive < MORE_RANGES * tried[one]]
         if len(left) == len(possible):
             return self._replace(known=found)
-        more, failed = extended(found, used, left), dict(self.failed)
+        anew = not left and found.located == used.started
+        more = from_nothing(used, FEWEST_DECISIVE) if anew else extended(found, used, left)
+        failed = dict(self.failed)
         for one in candidates(more.located, used):
             if one not in left:
                 failed[tuple([names[k] for k in one.robots])] = one.decisive

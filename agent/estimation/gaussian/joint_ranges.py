@@ -77,6 +77,15 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         # numpy.unique would import numpy.ma in the first search of a mission
         return [self.radio == one for one in sorted(set(self.radio.tolist()) - {-1})]
 
+    @cached_property
+    def of_anchors(self) -> dict[int, list[Places]]:
+        """The rows of the ranges to each of its anchors, of each robot that has some."""
+        found = dict[int, list[Places]]()
+        for rows in map(np.flatnonzero, self.pairs):
+            if self.second[rows[0]] < 0:
+                found.setdefault(int(self.first[rows[0]]), []).append(rows)
+        return found
+
     def common_errors(self, priors: Priors) -> Array:
         """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
 

@@ -98,7 +98,17 @@ def search(
     A pair is located from `fewest` ranges of each pair of radios on. Where both robots of a pair run in one
     process, they mostly search with the same measurements in the same tick.
     """
-    return merged(known, extended(NO_HYPOTHESES, measured, fewest=fewest), measured)
+    return merged(known, from_nothing(measured, fewest), measured)
+
+
+@lru_cache(maxsize=16)
+def from_nothing(measured: JointMeasurements, fewest: int) -> Posterior:
+    """Return the hypotheses about all robots that their ranges locate, by these alone.
+
+    A robot of a team that is located for the first time searches in the same tick, as it may claim its pose.
+    If all run in one process, some of up to 16 robots have the same measurements.
+    """
+    return extended(NO_HYPOTHESES, measured, fewest=fewest)
 
 
 def extended(
@@ -174,8 +184,8 @@ def _anchors_of_pair(
     a: int, b: int, measured: JointMeasurements, fewest: int
 ) -> tuple[Places, Places] | None:
     """Return the ranges of each robot to its anchor: those with the most ranges, at different places."""
-    own = [[rows for rows in _of_anchors(robot, measured) if len(rows) >= fewest] for robot in (a, b)]
-    place = measured.ranges.place
+    place, rows_of = measured.ranges.place, measured.ranges.of_anchors
+    own = [[rows for rows in rows_of.get(robot, ()) if len(rows) >= fewest] for robot in (a, b)]
     choices = [
         (len(one) + len(other), one, other)
         for one in own[0]
@@ -186,13 +196,6 @@ def _anchors_of_pair(
         return None
     _, one, other = max(choices, key=lambda choice: choice[0])
     return one, other
-
-
-def _of_anchors(robot: int, measured: JointMeasurements) -> list[Places]:
-    """Return the rows of the ranges of `robot` to each of its anchors."""
-    ranges = measured.ranges
-    fixed = (ranges.first == robot) & (ranges.second < 0)
-    return [np.flatnonzero(own & fixed) for own in ranges.pairs if np.any(own & fixed)]
 
 
 # --- locating ---------------------------------------------------------------------------------------------
