@@ -495,3 +495,14 @@ def test_no_fit_weighs_more_ranges_between_robots_than_it_can_afford() -> None:
     assert MOST_MUTUAL_RANGES // 2 < mutual <= MOST_MUTUAL_RANGES
     to_anchors = [np.count_nonzero(one.ranges.second < 0) for one in (thinned, measured)]
     assert to_anchors[0] == to_anchors[1]
+
+
+def test_a_fit_weighs_as_many_ranges_to_anchors_without_a_position_as_to_surveyed_ones() -> None:
+    names, ticks = [f"A{k}" for k in range(8)], 200
+    known = [manoeuvre("r", tick, Manoeuvre(0.2, 0.2)) for tick in range(ticks)]
+    known += [anchor_range("r", name, tick, 3.0, 0.05) for name in names for tick in range(ticks)]
+    for sigma in (0.0, math.inf):
+        measured = joint_measurements(
+            [*known, *[anchor(one, 1.0, 2.0, sigma) for one in names]], Noise(0.05, 0.05), PERIOD_S, REACH
+        )
+        assert len(measured.thinned(REACH).ranges.rho) == len(names) * ticks > MOST_MUTUAL_RANGES

@@ -318,13 +318,13 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
             most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
         if len(ranges.rho) <= min(most, MOST_MUTUAL_RANGES // max(len(pairs), 1)):
             return self
-        mutual = sum(1 for own in pairs if ranges.second[np.argmax(own)] >= 0)
-        of_pair = min(most, max(MOST_MUTUAL_RANGES // max(mutual, 1), WEIGHED_OF_PAIR))
+        rows_of = list(map(np.flatnonzero, pairs))
+        mutual = [(k := int(ranges.second[rows[0]])) >= 0 and not self.is_anchor(k) for rows in rows_of]
+        of_pair = min(most, max(MOST_MUTUAL_RANGES // max(sum(mutual), 1), WEIGHED_OF_PAIR))
         left = np.zeros(len(ranges.rho), bool)
-        for own in pairs:
-            rows = np.flatnonzero(own)
+        for rows, both_drive in zip(rows_of, mutual, strict=True):
             before = int(np.count_nonzero(ranges.tick[rows] <= tick))
-            bound = of_pair if ranges.second[rows[0]] >= 0 else most
+            bound = of_pair if both_drive else most
             left[rows[:before]] = True
             left[rows[before + _recent(len(rows) - before, bound)]] = True
         return self if left.all() else msgspec.structs.replace(self, ranges=ranges.rows(left))
