@@ -16,9 +16,12 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import tandem
+from agent.estimation import following
+from agent.estimation.gaussian import search as searching
 from agent.estimation.gaussian.claim_agreement import united
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
-from agent.estimation.posterior import carried
+from agent.estimation.posterior import Posterior, carried
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
 from agent.planning.team import TeamPlanner
@@ -151,6 +154,22 @@ def test_robots_survey_an_anchor_where_the_known_ones_tell_in_which_frame_it_sta
     run = run_mission(replace(load("survey", seed=19), max_ticks=60))
     assert run.end is not None
     assert run.end.outcome == "localised"
+
+
+def test_a_robot_that_is_located_for_the_first_time_searches_its_measurements_once(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    searched, extended = list[JointMeasurements](), searching.extended
+
+    def counted(known: Posterior, measured: JointMeasurements, *more: Any, **named: Any) -> Posterior:
+        searched.append(measured)
+        return extended(known, measured, *more, **named)
+
+    searching.from_nothing.cache_clear()
+    for module in (searching, following):
+        monkeypatch.setattr(module, "extended", counted)
+    assert outcome(run_mission(load("relative"))) == "localised"
+    assert len(searched) == len(set(searched)) > 2
 
 
 def test_a_robot_gives_up_if_twice_as_many_ranges_still_blame_one_of_two_anchors() -> None:
