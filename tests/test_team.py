@@ -172,6 +172,21 @@ def test_a_robot_that_is_located_for_the_first_time_searches_its_measurements_on
     assert len(searched) == len(set(searched)) > 2
 
 
+def test_a_survey_says_where_each_anchor_stands_and_by_how_much_that_may_be_off(tmp_path: Path) -> None:
+    said = tandem_command("run", "survey", "--in-process", "--no-export", "--out", tmp_path / "out")
+    run = read(tmp_path / "out")
+    assert run.scenario.team is not None
+    places = {one.told.id: one.place for one in run.scenario.team.anchors if one.told.position is None}
+    found = json.loads((tmp_path / "out" / "summary.json").read_text())["team"]["anchors"]
+    assert list(found) == list(places) == ["A3", "A4", "A5", "A6", "A7", "A8"]
+    assert found == summary(run, None, None)["team"]["anchors"], "from the journals"
+    for name, one in found.items():
+        (x, y), place = one["position"], places[name]
+        assert one["error_m"] == math.hypot(x - place.x, y - place.y) <= one["bound_m"]
+        assert one["bound_m"] == 3.0 * one["sigma_m"] <= 3.0 * run.scenario.team.survey
+        assert f"anchor {name}: {x:.2f} {y:.2f}, within {one['bound_m']:.2g} m (3 sigma)" in said.out
+
+
 def test_a_robot_gives_up_if_twice_as_many_ranges_still_blame_one_of_two_anchors() -> None:
     """Only their distance is wrong, so both are named; more ranges would say the same for 1 009 ticks."""
     survey = file_table(load("survey"))
@@ -333,7 +348,11 @@ def test_the_others_go_on_without_a_robot_that_dies_and_the_outcome_names_it(tmp
     assert (ended.status, tandem_command("audit", out).status) == (1, 0), ended
     summed = json.loads((out / "summary.json").read_text())
     assert (summed["outcome"], summed["reason"]) == ("undecided", "b is dead from tick 4 on")
-    assert summed["team"] == {"not_localised": {"b": "it is dead from tick 4 on"}, "deaths": {"b": 4}}
+    assert summed["team"] == {
+        "anchors": {},
+        "not_localised": {"b": "it is dead from tick 4 on"},
+        "deaths": {"b": 4},
+    }
     assert [summed["robots"][robot]["localised"] for robot in "abc"] == [True, False, True]
     assert validate(file_table(read(out).scenario), "again").scenario == read(out).scenario
 

@@ -262,12 +262,16 @@ class Run(msgspec.Struct, frozen=True, dict=True):
         one = self.claim(robot)
         if one is None or one.covariance is None:
             return None
-        estimate = self.claim_estimates.get(robot)
-        if estimate is None and robot in self.agents:
-            estimate = next((e for e in self.agents[robot].estimates if e.tick == one.tick), None)
+        estimate = self.claim_estimate(robot, one.tick)
         if estimate is None:
             return None
         return truth_held(estimate, self.truth(robot)[one.tick], self.scenario.mission.accuracy)
+
+    def claim_estimate(self, robot: str, tick: int) -> Estimate | None:
+        """Return the Estimate of `robot` in the `tick` of its standing claim; None if it is not recorded."""
+        if robot in self.claim_estimates or robot not in self.agents:
+            return self.claim_estimates.get(robot)
+        return next((one for one in self.agents[robot].estimates if one.tick == tick), None)
 
     # --- the end ---
 

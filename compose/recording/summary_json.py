@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import platform
 from collections.abc import Mapping
 from functools import cache
@@ -10,6 +11,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 import msgspec
+from msgspec.structs import astuple
 
 from compose.extras import version
 from compose.recording.closest_approach import nearest
@@ -25,6 +27,12 @@ from world.referee import not_localised
 
 Mode = Literal["processes", "in-process"]
 SUMMARY_JSON = "summary.json"
+
+BOUND_SIGMAS = 3.0
+"""The bound of the error of an anchor's position, in its sigmas.
+
+The error exceeds it with a probability of 1e-4 if it is the same in all directions, and of 0.003 at most.
+"""
 
 
 def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]:
@@ -61,7 +69,14 @@ def summary(run: Run, mode: Mode | None, wall_s: float | None) -> dict[str, Any]
     }
     if scenario.in_pairs:
         return found
-    return {**found, **({"group": _group(run) | _lost(run)} if scenario.meetings else {"team": _lost(run)})}
+    return {
+        **found,
+        **(
+            {"group": _group(run) | _lost(run)}
+            if scenario.meetings
+            else {"team": {"anchors": _surveyed(run), **_lost(run)}}
+        ),
+    }
 
 
 def _lost(run: Run) -> dict[str, Any]:
@@ -70,6 +85,25 @@ def _lost(run: Run) -> dict[str, Any]:
     return {
         "not_localised": {robot: of_it(cause) for robot, cause in left.items()},
         "deaths": {one.robot: one.tick for one in run.scenario.deaths},
+    }
+
+
+def _surveyed(run: Run) -> dict[str, Any]:
+    """Return where each anchor that is not surveyed stands, by the robot that claimed its pose last."""
+    claims = [
+        (one.tick, -k, name) for k, name in enumerate(run.robots) if (one := run.claim(name)) is not None
+    ]
+    tick, _, last = max(claims, default=(0, 0, ""))
+    estimate, team = run.claim_estimate(last, tick), run.scenario.team
+    true = {one.told.id: one.place for one in team.anchors} if team is not None else {}
+    return {
+        one.id: {
+            "position": [one.position.x, one.position.y],
+            "sigma_m": one.sigma,
+            "bound_m": BOUND_SIGMAS * one.sigma,
+            "error_m": math.dist(astuple(one.position), astuple(true[one.id])),
+        }
+        for one in (estimate.anchors if estimate is not None else ())
     }
 
 

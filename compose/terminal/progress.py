@@ -60,6 +60,9 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     say("", *lines, "", *text_width.notes(TABLE_NOTES, columns))
     if group is not None:
         say(*text_width.wrapped(_bound(group, robots)))
+    for name, anchor in summary.get("team", {}).get("anchors", {}).items():
+        x, y = anchor["position"]
+        say(f"anchor {name}: {x:.2f} {y:.2f}, within {anchor['bound_m']:.2g} m (3 sigma)")
     if late:
         say(*text_width.wrapped(_missed(late, summary["ticks"], rate)))
     claiming = [set(one["unverified_anchors"] or ()) for one in robots.values() if one["localised"]]
