@@ -16,9 +16,11 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 import tandem
-from agent.estimation import following
+from agent.estimation import following, judged
+from agent.estimation.fit import Fit
 from agent.estimation.gaussian import search as searching
 from agent.estimation.gaussian.claim_agreement import united
+from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
 from agent.estimation.posterior import Posterior, carried
@@ -170,6 +172,21 @@ def test_a_robot_that_is_located_for_the_first_time_searches_its_measurements_on
         monkeypatch.setattr(module, "extended", counted)
     assert outcome(run_mission(load("relative"))) == "localised"
     assert len(searched) == len(set(searched)) > 2
+
+
+def test_robots_ask_for_rivals_of_their_claims_only_when_the_survey_has_ended(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    asked = list[int]()
+
+    def counted(fit: Fit, measured: JointMeasurements, *more: Any) -> Rival:
+        asked.append(max(len(path.v) for path in measured.paths))
+        return likeliest_rival(fit, measured, *more)
+
+    monkeypatch.setattr(judged, "likeliest_rival", counted)
+    run = run_mission(load("survey"))
+    claims = [made for robot in run.robots if (made := run.standing_claim(robot)) is not None]
+    assert asked == [tick for tick, _ in claims]
 
 
 def test_a_survey_says_where_each_anchor_stands_and_by_how_much_that_may_be_off(tmp_path: Path) -> None:

@@ -301,6 +301,10 @@ BEFORE_SEARCH = tuple([one for one in CONDITIONS if not one.last])
 """The conditions that a robot asks in each tick. If they hold, it searches the whole plane, and asks all."""
 
 
+WITHOUT_FITS = tuple([one for one in CONDITIONS if one not in (profiles, parts, rivals)])
+"""The conditions that take no fits of their own: enough while something else holds back the claim."""
+
+
 class Blocked(NamedTuple):
     """The result of a claim for which a condition is not met."""
 

@@ -6,10 +6,19 @@ before the first claim of each robot.
 
 from __future__ import annotations
 
-from collections.abc import Container, Mapping
+from collections.abc import Container, Mapping, Sequence
 from typing import NamedTuple
 
-from agent.estimation.claim import BEFORE_SEARCH, blocked, consistency, parts, parts_before, strays
+from agent.estimation.claim import (
+    BEFORE_SEARCH,
+    CONDITIONS,
+    Condition,
+    blocked,
+    consistency,
+    parts,
+    parts_before,
+    strays,
+)
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, displacements
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -105,10 +114,17 @@ class Following(NamedTuple):
     begun_again: int = 0
     """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
 
-    def after(self, used: JointMeasurements, rule: ClaimRule, user: User, asked: Container[str]) -> Following:
+    def after(
+        self,
+        used: JointMeasurements,
+        rule: ClaimRule,
+        user: User,
+        asked: Container[str],
+        conditions: Sequence[Condition] = CONDITIONS,
+    ) -> Following:
         """Return the estimate by what is `used`, which has grown since the last one.
 
-        The robots `asked` may claim their poses; the plane is searched before that.
+        The robots `asked` may claim their poses on these `conditions`; the plane is searched before that.
 
         A team whose measurements contradict all hypotheses begins again, with ever more ranges. A recording
         has other robots, and errors that nobody has told.
@@ -122,7 +138,7 @@ class Following(NamedTuple):
         known = ended(settled(known, used), used)
         now = self._extended(known if known.hypotheses else begun(used), used)
         due = now.known.hypotheses and any(self.searched < at <= count for at in GROUP_SEARCHES)
-        now = now._tested(used, rule, user, asked)
+        now = now._tested(used, rule, user, asked, conditions)
         claiming = now._claiming - self.claimed
         if claiming and not due and self.searches >= MOST_SEARCHES:
             now = now._replace(reasons={**now.reasons, **dict.fromkeys(sorted(claiming), GIVEN_UP)})
@@ -131,7 +147,7 @@ class Following(NamedTuple):
             now = now._replace(
                 known=found, searched=count, searches=self.searches + 1, compared=self.compared
             )
-            now = now._tested(used, rule, user, asked)
+            now = now._tested(used, rule, user, asked, conditions)
         return now._replace(claimed=self.claimed | now._claiming)
 
     @property
@@ -166,7 +182,12 @@ class Following(NamedTuple):
         return self._replace(known=more, failed=failed)
 
     def _tested(
-        self, used: JointMeasurements, rule: ClaimRule, user: User, asked: Container[str]
+        self,
+        used: JointMeasurements,
+        rule: ClaimRule,
+        user: User,
+        asked: Container[str],
+        conditions: Sequence[Condition],
     ) -> Following:
         """Return this with what blocks the claim of each located robot that is `asked`."""
         found = self.known
@@ -192,7 +213,7 @@ class Following(NamedTuple):
             if again:
                 doubted = doubted or count if displaced is not None else 0
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
-        reasons = {name: blocked(one) for name, one in judged.items()}
+        reasons = {name: blocked(one, conditions) for name, one in judged.items()}
         disagreed = {
             name: judged[name].passed for name, one in reasons.items() if one and one.condition is parts
         }

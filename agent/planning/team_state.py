@@ -10,6 +10,7 @@ from typing import NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from agent.estimation.claim import CONDITIONS, WITHOUT_FITS, blocked
 from agent.estimation.following import ClaimRule, Following
 from agent.estimation.gaussian.claim_agreement import united
 from agent.estimation.gaussian.joint_claims import undetermined
@@ -188,6 +189,9 @@ def followed(state: TeamState) -> TeamState:
     wanted = _wanted(joint.following, state.team, state.config.mission.confidence)
     if wanted and not joint.why_not:
         joint = joint._replace(why_not=f"anchor {wanted[0]} is not known to {state.team.survey:g} m yet")
+    elif state.team.survey and not joint.why_not:
+        found = blocked(joint.following.judged[state.config.robot])
+        joint = joint._replace(why_not=found.reason if found is not None else "")
     pairs = [
         _estimated(state, pair, (own, k)) if k != own and logs[k] else pair
         for k, pair in enumerate(state.pairs)
@@ -200,7 +204,8 @@ def _estimated(state: TeamState, before: TeamEstimate, of: Collection[int] | Non
     mission, robot = state.config.mission, state.config.robot
     measured = before.measured.grown(state.log, state.team, mission, of)
     used, rule = measured.joint(state.team, mission), ClaimRule(mission.accuracy, mission.confidence)
-    following = before.following.after(used, rule, "team", (robot,))
+    conditions = WITHOUT_FITS if state.team.survey else CONDITIONS
+    following = before.following.after(used, rule, "team", (robot,), conditions)
     why_not = following.reasons.get(robot)
     if why_not is None:
         why_not = undetermined(used.robots.index(robot), following.known.located, used)
