@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from operator import itemgetter
 
 import numpy as np
 
@@ -91,7 +92,7 @@ def of_rows(
         if row.tick <= len(steps[row.first])
         and (row.tick <= len(steps[row.second]) if row.mutual else row.second in places)
     ]
-    rows.sort(key=lambda row: row[:4])
+    rows.sort(key=itemgetter(0, 1, 2, 3))
     used = tuple(sorted({row.second for row in rows if not row.mutual}))
     unsure = [one for one in used if one not in surveyed]
     unsure.sort(key=lambda name: places[name].sigma < math.inf)
@@ -101,7 +102,7 @@ def of_rows(
     first = sorted(used, key=lambda name: places[name].sigma)[:1]
     origin = places[first[0]] if first else AnchorPlace(0.0, 0.0)
     at = [surveyed.get(row.second, origin) for row in rows]
-    standing = [Manoeuvre(0.0, 0.0)] * max(map(len, steps.values()), default=0)
+    standing = _path([Manoeuvre(0.0, 0.0)] * max(map(len, steps.values()), default=0), period)
     relative = [
         one and one._replace(x=one.x - origin.x, y=one.y - origin.y)
         for one in (*map(starts.get, robots), *map(places.get, unsure))
@@ -111,7 +112,7 @@ def of_rows(
         tuple(index),
         used,
         radios,
-        tuple([_path(steps.get(name, standing), period) for name in index]),
+        tuple([_path(steps[name], period) if name in steps else standing for name in index]),
         JointRanges(
             np.array([row.measured.range for row in rows], np.float64),
             np.array([row.tick for row in rows], np.intp),
