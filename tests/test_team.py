@@ -151,9 +151,15 @@ def test_a_claim_says_across_which_line_of_anchors_no_range_tells_where_they_sta
     assert "no range tells whether A1, A2 stand elsewhere than told" in said.out
 
 
+def to_a_sigma(sigma: float, scenario: Scenario) -> Scenario:
+    """Return a scenario in which anchors are surveyed to a `sigma` (m)."""
+    assert scenario.team is not None
+    return replace(scenario, team=replace(scenario.team, survey=sigma))
+
+
 def test_robots_survey_an_anchor_where_the_known_ones_tell_in_which_frame_it_stands() -> None:
     """A3 and A7 are in a corner of the square from where only one of the two known anchors is in range."""
-    run = run_mission(replace(load("survey", seed=19), max_ticks=60))
+    run = run_mission(to_a_sigma(0.05, replace(load("survey", seed=19), max_ticks=60)))
     assert run.end is not None
     assert run.end.outcome == "localised"
 
@@ -184,7 +190,7 @@ def test_robots_ask_for_rivals_of_their_claims_only_when_the_survey_has_ended(
         return likeliest_rival(fit, measured, *more)
 
     monkeypatch.setattr(judged, "likeliest_rival", counted)
-    run = run_mission(load("survey"))
+    run = run_mission(to_a_sigma(0.05, load("survey")))
     claims = [made for robot in run.robots if (made := run.standing_claim(robot)) is not None]
     assert asked == [tick for tick, _ in claims]
 
@@ -200,7 +206,7 @@ def test_a_survey_says_where_each_anchor_stands_and_by_how_much_that_may_be_off(
     for name, one in found.items():
         (x, y), place = one["position"], places[name]
         assert one["error_m"] == math.hypot(x - place.x, y - place.y) <= one["bound_m"]
-        assert one["bound_m"] == 3.0 * one["sigma_m"] <= 3.0 * run.scenario.team.survey
+        assert one["bound_m"] == 3.0 * one["sigma_m"] <= 0.05
         assert f"anchor {name}: {x:.2f} {y:.2f}, within {one['bound_m']:.2g} m (3 sigma)" in said.out
 
 
