@@ -66,12 +66,13 @@ DISPLACED = (consistency, strays)
 
 
 class ClaimRule(NamedTuple):
-    """The accuracy and the confidence that a claim needs."""
+    """The accuracy and the confidence that a claim needs, and the conditions that are asked."""
 
     accuracy: float = 0.3
     """The largest sigma of the position in m: the root of the trace of its covariance."""
     confidence: float = 0.9999
     """The least probability of the hypothesis."""
+    conditions: Sequence[Condition] = CONDITIONS
 
 
 EXACT_ACCURACY = 1e-5
@@ -114,17 +115,10 @@ class Following(NamedTuple):
     begun_again: int = 0
     """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
 
-    def after(
-        self,
-        used: JointMeasurements,
-        rule: ClaimRule,
-        user: User,
-        asked: Container[str],
-        conditions: Sequence[Condition] = CONDITIONS,
-    ) -> Following:
+    def after(self, used: JointMeasurements, rule: ClaimRule, user: User, asked: Container[str]) -> Following:
         """Return the estimate by what is `used`, which has grown since the last one.
 
-        The robots `asked` may claim their poses on these `conditions`; the plane is searched before that.
+        The robots `asked` may claim their poses; the plane is searched before that.
 
         A team whose measurements contradict all hypotheses begins again, with ever more ranges. A recording
         has other robots, and errors that nobody has told.
@@ -138,7 +132,7 @@ class Following(NamedTuple):
         known = ended(settled(known, used), used)
         now = self._extended(known if known.hypotheses else begun(used), used)
         due = now.known.hypotheses and any(self.searched < at <= count for at in GROUP_SEARCHES)
-        now = now._tested(used, rule, user, asked, conditions)
+        now = now._tested(used, rule, user, asked)
         claiming = now._claiming - self.claimed
         if claiming and not due and self.searches >= MOST_SEARCHES:
             now = now._replace(reasons={**now.reasons, **dict.fromkeys(sorted(claiming), GIVEN_UP)})
@@ -147,7 +141,7 @@ class Following(NamedTuple):
             now = now._replace(
                 known=found, searched=count, searches=self.searches + 1, compared=self.compared
             )
-            now = now._tested(used, rule, user, asked, conditions)
+            now = now._tested(used, rule, user, asked)
         return now._replace(claimed=self.claimed | now._claiming)
 
     @property
@@ -182,19 +176,14 @@ class Following(NamedTuple):
         return self._replace(known=more, failed=failed)
 
     def _tested(
-        self,
-        used: JointMeasurements,
-        rule: ClaimRule,
-        user: User,
-        asked: Container[str],
-        conditions: Sequence[Condition],
+        self, used: JointMeasurements, rule: ClaimRule, user: User, asked: Container[str]
     ) -> Following:
         """Return this with what blocks the claim of each located robot that is `asked`."""
         found = self.known
         part = used.some(found.located)
         judged = {
             part.robots[i]: of_joint(
-                *(user, i, found, certainty, part, *rule),
+                *(user, i, found, certainty, part, rule.accuracy, rule.confidence),
                 self.disagreed.get(part.robots[i], 0),
                 self.compared.get(part.robots[i], 0),
             )
@@ -213,7 +202,7 @@ class Following(NamedTuple):
             if again:
                 doubted = doubted or count if displaced is not None else 0
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
-        reasons = {name: blocked(one, conditions) for name, one in judged.items()}
+        reasons = {name: blocked(one, rule.conditions) for name, one in judged.items()}
         disagreed = {
             name: judged[name].passed for name, one in reasons.items() if one and one.condition is parts
         }

@@ -203,9 +203,10 @@ def _estimated(state: TeamState, before: TeamEstimate, of: Collection[int] | Non
     """Return the estimate that goes on from the one `before`, by the measurements `of` robots; None: all."""
     mission, robot = state.config.mission, state.config.robot
     measured = before.measured.grown(state.log, state.team, mission, of)
-    used, rule = measured.joint(state.team, mission), ClaimRule(mission.accuracy, mission.confidence)
     conditions = WITHOUT_FITS if state.team.survey else CONDITIONS
-    following = before.following.after(used, rule, "team", (robot,), conditions)
+    rule = ClaimRule(mission.accuracy, mission.confidence, conditions)
+    used = measured.joint(state.team, mission)
+    following = before.following.after(used, rule, "team", (robot,))
     why_not = following.reasons.get(robot)
     if why_not is None:
         why_not = undetermined(used.robots.index(robot), following.known.located, used)

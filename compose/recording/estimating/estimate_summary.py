@@ -53,7 +53,7 @@ def summary_of(measured: Measurements, epochs: Sequence[EstimateEpoch], rule: Cl
         measured.noise,
         measured.t0,
         measured.relative_to,
-        *rule,
+        *(rule.accuracy, rule.confidence),
         {
             one.id: _of_robot(one, [row for row in rows if row.robot == one.id], claims[one.id], last.t)
             for one in robots
