@@ -93,6 +93,14 @@ def test_an_input_is_examined_and_a_defect_is_named(monkeypatch: pytest.MonkeyPa
     assert examined({**table, "seed": -1}).refused is not None
 
 
+def test_an_input_reaches_the_same_after_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(claim, "Blocked", claim.Blocked)  # it is the one of before after this test
+    coverage.note_conditions()
+    alone = examined(scenario_table("paper-1"))
+    examined(scenario_table("noisy"))
+    assert examined(scenario_table("paper-1")) == alone
+
+
 def test_the_parts_of_an_input_are_left_out_one_after_the_other() -> None:
     table = scenario_table("paper-1")
     worse = {**table, "kill": [{"who": "a", "tick": 3, "after": 1.0}, {"who": "b", "tick": 4}]}

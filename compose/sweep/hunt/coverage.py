@@ -41,6 +41,7 @@ class WatchedPlanner:
     def __init__(self, config: RobotConfig, seen: set[str]) -> None:
         self._planner: Planner[Any, Any] = planner_of(config)
         self._seen = seen
+        _unmet.clear()  # what an earlier run has left
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._planner, name)
