@@ -1,8 +1,9 @@
 """A mission whose processes are threads of this one, over a network and a clock in memory.
 
 The world and the agents run as they do as processes, with files for journals. Exactly one of them runs at a
-time, and the clock only advances while all wait. So the same scenario and kills give the same order of
-events, and a wait of seconds takes none. A kill ends a thread where its process would have ended; what it has
+time, and the clock only advances while all wait: the thread that begins to wait advances it, until a thread
+has something to do. So the same scenario and kills give the same order of events, and a wait of seconds takes
+none. A kill ends a thread where its process would have ended; what it has
 not written is lost.
 """
 
@@ -95,34 +96,48 @@ class VirtualProcess:
         self.left = [kill for kill in network.kills if kill.who == name]
         """The kills that have not taken place."""
         self._network = network
-        self._turn = threading.Semaphore(0)
-        self._back = threading.Semaphore(0)
+        self._turn = held()
+        self._thread: threading.Thread | None = None
         self._waits = 0
         """The number of waits so far, so that the end of an earlier one does not wake it."""
         self.link: VirtualLink | None = None
         """The session; None while the process does not run."""
 
     def start(self) -> None:
-        """Start the process, and run it until it waits."""
+        """Start the process: it is the next to run."""
         self.link = VirtualLink(self._network, self)
-        threading.Thread(target=self._main, daemon=True).start()
-        self._back.acquire()
+        self._thread = threading.Thread(target=self._main, daemon=True)
+        self._network.ready.append(self)
 
     def wait(self, until: float) -> None:
         """Let others run until the clock reaches `until`, or an event arrives."""
         self._waits += 1
         if until < math.inf:
             self._network.at(until, lambda waits=self._waits: self.wake(waits))  # type: ignore[misc]
-        self._back.release()
-        self._turn.acquire()
+        if (following := self._network.advanced()) is not self:
+            self._network.pass_to(following)
+            self._turn.acquire()
         if self._network.over:
             raise _Killed
 
     def wake(self, waits: int | None = None) -> None:
-        """Run the process until it waits, if it is in its wait number `waits`, or in any if that is None."""
+        """Let the process run next, if it is in its wait number `waits`, or in any if that is None."""
         if self.link is not None and waits in (None, self._waits):
+            self._network.ready.append(self)
+
+    def go_on(self) -> None:
+        """Let the thread of the process run, which has just been started or waits."""
+        assert self._thread is not None
+        if self._thread.ident is None:
+            self._thread.start()
+        else:
             self._turn.release()
-            self._back.acquire()
+
+    def end(self) -> None:
+        """End the thread of the process, if it waits."""
+        if self.link is not None and self._thread is not None and self._thread.ident is not None:
+            self._turn.release()
+            self._thread.join()
 
     def _main(self) -> None:
         network = self._network
@@ -138,7 +153,8 @@ class VirtualProcess:
         finally:
             network.close(self.link)
             self.link = None
-            self._back.release()
+            if not network.over:
+                network.pass_to(network.advanced())
 
     def _restart(self) -> None:
         kill = self.left.pop(0)
@@ -191,6 +207,11 @@ class VirtualNetwork:
         """The time of the latest arrival at each link on each key."""
         self._woken: dict[VirtualProcess, None] = {}
         """The processes for which something has arrived at this time, in its order."""
+        self.ready = deque[VirtualProcess]()
+        """The processes that run before the clock advances, in their order."""
+        self._processes: list[VirtualProcess] = []
+        self._ended = held()
+        """The lock that is released at the end of the mission."""
         self._matching: dict[str, list[tuple[VirtualLink, Callable[[_Sample], None]]]] = {}
 
     def at(self, due: float, act: Callable[[], None]) -> None:
@@ -199,21 +220,38 @@ class VirtualNetwork:
 
     def run(self, bodies: Mapping[str, Body]) -> None:
         """Run a process for each of `bodies`, by name, until they have ended, or one has failed."""
-        processes = [VirtualProcess(self, name, body) for name, body in bodies.items()]
-        for one in processes:
+        self._processes = [VirtualProcess(self, name, body) for name, body in bodies.items()]
+        for one in self._processes:
             self.at(0.0, one.start)
-        while (self._due or self._woken) and not self.failures and len(self.ended) < len(processes):
-            self.now, _, act = heapq.heappop(self._due)
-            act()
-            if not self._due or self._due[0][0] > self.now:
-                woken, self._woken = self._woken, {}
-                for one in woken:
-                    one.wake()
-        if not self._due and len(self.ended) < len(processes):
-            self.failures.append("a process that was killed is missing")
-        self.over = True
-        for one in processes:
-            one.wake()
+        try:
+            self.pass_to(self.advanced())
+            self._ended.acquire()
+        finally:
+            self.over = True
+        for one in self._processes:
+            one.end()
+
+    def advanced(self) -> VirtualProcess | None:
+        """Advance the clock until a process has something to do, and return it; None at the end."""
+        while not self.ready:
+            if self._woken and (not self._due or self._due[0][0] > self.now):
+                self.ready.extend([one for one in self._woken if one.link is not None])
+                self._woken.clear()
+            elif self.failures or len(self.ended) == len(self._processes):
+                return None
+            elif not self._due:
+                self.failures.append("a process that was killed is missing")
+            else:
+                self.now, _, act = heapq.heappop(self._due)
+                act()
+        return self.ready.popleft()
+
+    def pass_to(self, process: VirtualProcess | None) -> None:
+        """Let the thread of `process` run in the place of this one, or that of the mission if it is None."""
+        if process is not None:
+            process.go_on()
+        else:
+            self._ended.release()
 
     def send(self, key: str, frame: bytes) -> None:
         """Deliver `frame` to all subscribers of `key`, after a time of LATENCIES_S."""
@@ -311,6 +349,13 @@ class VirtualLink:
             ),
             declare_token=declare_token,
         )
+
+
+def held() -> threading.Lock:
+    """Return a lock that is held, so that one thread waits for it until another one releases it."""
+    lock = threading.Lock()
+    lock.acquire()
+    return lock
 
 
 def _ignored(_: object) -> None:
