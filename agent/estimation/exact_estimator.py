@@ -73,7 +73,8 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         del second_range
         observations = knowledge.pair_observations(first_tick)
         ranged = [at for at in observations if at.range is not None]
-        away_from_m2 = [at for at in ranged if off_anchor(at.b, knowledge.config.rendezvous.b)]
+        orbit = knowledge.config.rendezvous.b
+        away_from_m2 = [at for at in ranged if off_anchor(at.b, orbit)]
         through = min(knowledge.tick, knowledge.peer_state.peer.through)
         odometry_rounding = precision.odometry_rounding(knowledge, through)
         pair_base = base(away_from_m2, odometry_rounding)

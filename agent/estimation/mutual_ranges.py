@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 
 from agent.estimation.closed_forms import Placement, placements
 from agent.estimation.exact import PairObservation
@@ -36,13 +37,11 @@ def base(
             == (pair_observation.a, pair_observation.b)  # neither robot has moved in between
         ):
             ranged.append(pair_observation)
-    for first in ranged:
-        for second in ranged:
-            stood, moved = travelled(first.b, second.b) <= floor, travelled(first.a, second.a) > ELSEWHERE
-            if first.tick < second.tick and stood and moved:
-                near = B_ON_M1 * travelled(first.a, second.a)
-                if not (_b_may_be_on_m1(first, near) and _b_may_be_on_m1(second, near)):
-                    return first, second
+    for first, second in combinations(ranged, 2):
+        if travelled(first.b, second.b) <= floor and travelled(first.a, second.a) > ELSEWHERE:
+            near = B_ON_M1 * travelled(first.a, second.a)
+            if not (_b_may_be_on_m1(first, near) and _b_may_be_on_m1(second, near)):
+                return first, second
     return None
 
 
