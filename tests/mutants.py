@@ -124,7 +124,7 @@ def bound() -> None:
         group_meetings,
         "group_meetings",
         "one.ends) for one in meetings])",
-        "min(one.ends, meetings[-2].ends)) for one in meetings])",
+        "min(one.ends, meetings[-2:][0].ends)) for one in meetings])",
     )
 
 

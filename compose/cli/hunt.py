@@ -61,7 +61,8 @@ def main(options: argparse.Namespace) -> int:
 def _say_reached(hunt: Hunt, scenario: str, seconds: float) -> None:
     tell(
         f"{scenario}: {hunt.runs} runs in {seconds:.0f} s, {hunt.processes} also as processes; "
-        f"{hunt.refused} inputs are no mission; {len(hunt.seen)} states and transitions reached"
+        f"{hunt.refused} inputs are no mission, or last too long; "
+        f"{len(hunt.seen)} states and transitions reached"
     )
     for kind, names in never(hunt.seen).items():
         if names:

@@ -35,12 +35,17 @@ def note_conditions() -> None:
     claim.Blocked = _Noted  # type: ignore[misc]
 
 
+class TooLongError(Exception):
+    """The mission lasts longer than its planners were told."""
+
+
 class WatchedPlanner:
     """A planner that notes in `seen` which conditions kept a robot from its claim, and in which task."""
 
-    def __init__(self, config: RobotConfig, seen: set[str]) -> None:
+    def __init__(self, config: RobotConfig, seen: set[str], last: float) -> None:
+        """`last` is the tick after which `command` raises TooLongError."""
         self._planner: Planner[Any, Any] = planner_of(config)
-        self._seen = seen
+        self._seen, self._last = seen, last
         _unmet.clear()  # what an earlier run has left
 
     def __getattr__(self, name: str) -> Any:
@@ -49,6 +54,8 @@ class WatchedPlanner:
     def command(self, state: Any) -> Any:
         """Return the Command of the planner."""
         command = self._planner.command(state)
+        if command.tick > self._last:
+            raise TooLongError
         self._seen.update([f"{command.task}/{command.phase} withheld: {one}" for one in _unmet])
         _unmet.clear()
         return command

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import tempfile
 from pathlib import Path
 from typing import Any, cast
@@ -13,16 +14,21 @@ from compose.launch import in_process, virtual_hardware, virtual_processes
 from compose.recording.run import Run, of_frames
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
-from compose.sweep.hunt.coverage import WatchedPlanner, reached
-from compose.sweep.hunt.invariants import Breach, bounded, breaches
+from compose.sweep.hunt.coverage import TooLongError, WatchedPlanner, reached
+from compose.sweep.hunt.invariants import Breach, bounded, breaches, guaranteed
 from compose.sweep.hunt.mutation import Clues
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.clock import ClockError
 from protocol.wire import EncodedMessages
 from world.scenario import Scenario
 
-MOST_TICKS = 30_000
+MOST_TICKS = 120_000
 """The largest `max_ticks` of a mission, times its robots, that is run."""
+MOST_WITHOUT_END = 750
+"""The number of ticks after which a mission that need not localise its robots is given up.
+
+A robot that waits for what was lost waits until `max_ticks`, and each restart replays all of it.
+"""
 
 
 class Examined(msgspec.Struct, frozen=True):
@@ -31,8 +37,8 @@ class Examined(msgspec.Struct, frozen=True):
     breaches: tuple[Breach, ...] = ()
     reached: frozenset[str] = frozenset()
     known: Clues = Clues(())
-    bound_share: float = 0.0
-    """The largest time of something with a computed bound, relative to that."""
+    bound_shares: tuple[float, ...] = ()
+    """The time of each thing with a computed bound, relative to that."""
     refused: str | None = None
     """The reason why the input was not run; None if it was."""
 
@@ -54,6 +60,8 @@ def examined(table: dict[str, Any]) -> Examined:
     seen: set[str] = set()
     try:
         run, sinks = watched(scenario, seen)
+    except TooLongError:
+        return Examined(refused="it lasts too long")
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
     again = _again(scenario, kills, clocks, sinks)
@@ -61,17 +69,16 @@ def examined(table: dict[str, Any]) -> Examined:
     every = [*again, *breaches(run, replayed=not again)]
     ids = tuple([one.id for one in scenario.robots])
     found |= seen | {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
-    shares = [one.ticks / one.bound for one in bounded(run) if one.ticks is not None]
-    return Examined(
-        tuple(every), frozenset(found), Clues(ids, run.length - 1, moments), max(shares, default=0.0)
-    )
+    shares = tuple([one.ticks / one.bound for one in bounded(run) if one.ticks is not None])
+    return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments), shares)
 
 
 def watched(scenario: Scenario, seen: set[str]) -> tuple[Run, dict[str, MemoryJournal]]:
     """Return a run of `scenario` in this process with its journals; `seen` are the conditions not met."""
+    last = math.inf if guaranteed(scenario) else MOST_WITHOUT_END
     sinks, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
     in_process.played(
-        scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen)), messages.encode
+        scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen, last)), messages.encode
     )
     return of_frames({name: one.frames for name, one in sinks.items()}, messages=messages), sinks
 

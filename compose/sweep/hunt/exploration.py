@@ -16,7 +16,7 @@ from compose.launch.supervisor import ChildFailed
 from compose.sweep.hunt import coverage
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
-from compose.sweep.hunt.mutation import Clues, Table, is_noisy, mutated, seeds, simpler
+from compose.sweep.hunt.mutation import WITHIN_BOUNDS, Clues, Table, is_noisy, mutated, seeds, simpler
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
@@ -32,7 +32,7 @@ SEEDS_OF_BATCH = 1
 NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
 SLOWEST_SHARE = 0.1
-"""The share of inputs that are changes of the one that came nearest to a computed bound."""
+"""The share of inputs that are changes of those that came nearest to a computed bound."""
 NOISY_SLOWER = 20.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks."""
 
@@ -45,13 +45,13 @@ class CorpusEntry(NamedTuple):
 
     @property
     def share(self) -> float:
-        """The frequency of its changes, relative to others: it is larger if its run is shorter."""
-        return (
-            1.0
-            / (1 + self.known.ticks)
-            / len(self.known.robots)
-            / (NOISY_SLOWER if is_noisy(self.table) else 1.0)
-        )
+        """The frequency of its changes, relative to others: it is larger if its run is shorter.
+
+        A meeting that does not end tests all its ranges in each tick, so twice the ticks take up to four
+        times the time.
+        """
+        slower = NOISY_SLOWER if is_noisy(self.table) else 1.0
+        return 1.0 / (1 + self.known.ticks) ** 2 / len(self.known.robots) / slower
 
 
 class FoundBreach(NamedTuple):
@@ -73,14 +73,12 @@ class Hunt:
         self._seed, self._workers, self._guided = seed, workers, guided
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
-        self.slowest: CorpusEntry | None = None
-        """The input whose run used most of a computed bound."""
-        self.bound_share = 0.0
-        """The share that it used."""
+        self.slowest: dict[tuple[int, int], tuple[float, CorpusEntry]] = {}
+        """The inputs whose runs used most of a bound, with its share, by the number of bounds and its place."""
         self.seen: set[str] = set()
         """The states that the runs have reached."""
         self.runs = self.processes = self.refused = 0
-        """The numbers of inputs, of those that also ran as processes, and of those that are no mission."""
+        """The numbers of inputs, of those that also ran as processes, and of those that are not run to an end."""
 
     def run(self, is_over: Callable[[Hunt], bool]) -> FoundBreach | None:
         """Search until `is_over`, and return the first input that breaks an invariant, shrunk.
@@ -114,8 +112,9 @@ class Hunt:
             return mutated(one, known, draw.choice(self.seeds), draw)
         some = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
         [entry] = draw.choices(some, [one.share for one in some])
-        if self.slowest is not None and draw.random() < SLOWEST_SHARE:
-            entry = self.slowest
+        if self.slowest and draw.random() < SLOWEST_SHARE:
+            _, entry = draw.choice([*self.slowest.values()])
+            return mutated(entry.table, entry.known, entry.table, draw, WITHIN_BOUNDS)
         return mutated(entry.table, entry.known, draw.choice(self.corpus).table, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
@@ -123,8 +122,10 @@ class Hunt:
         self.seen |= new
         if new:
             self.corpus.append(CorpusEntry(table, result.known))
-        if result.bound_share > self.bound_share:
-            self.slowest, self.bound_share = CorpusEntry(table, result.known), result.bound_share
+        for place, share in enumerate(result.bound_shares):
+            which = len(result.bound_shares), place
+            if share > self.slowest.get(which, (0.0, None))[0]:
+                self.slowest[which] = share, CorpusEntry(table, result.known)
 
     def _shrunk(self, table: Table, breach: Breach, examine: Examine) -> FoundBreach:
         """Return the input nearest to the source with the same breach, as far as MOST_TRIES runs show."""

@@ -56,7 +56,7 @@ def _must_be_right(scenario: Scenario) -> bool:
     return scenario.mission.noise.exact or attackers <= scenario.tolerates
 
 
-def _guaranteed(scenario: Scenario) -> bool:
+def guaranteed(scenario: Scenario) -> bool:
     """Return whether every robot must be localised in the end, and within the bounds."""
     fair = all(one.let_through or one.ticks or one.contact_ticks for one in scenario.faults)
     fair = fair and not any(one.partition and not (one.ticks or one.contact_ticks) for one in scenario.faults)
@@ -85,7 +85,7 @@ def unfinished(run: Run) -> Iterator[Breach]:
     """Every robot is localised in the end, with exact sensors, honest peers and a radio that delivers."""
     if run.end is None:
         yield Breach("unfinished", "the mission has no end")
-    elif run.end.outcome != "localised" and _guaranteed(run.scenario):
+    elif run.end.outcome != "localised" and guaranteed(run.scenario):
         yield Breach("unfinished", f"tick {run.end.tick}: {run.end.outcome}: {run.end.causes}")
 
 
@@ -102,7 +102,7 @@ class Bounded(NamedTuple):
 def bounded(run: Run) -> Iterator[Bounded]:
     """Yield what has a bound in `run`: the meeting of a pair, or each robot that a group localises."""
     scenario = run.scenario
-    if not _guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
+    if not guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
         return
     if scenario.in_pairs:
         found = row(Trial(0, 0, scenario, processes=False), run, 0.0)

@@ -75,11 +75,17 @@ def is_noisy(table: Mapping[str, Any]) -> bool:
     return any(table["mission"].get("noise", {}).values())
 
 
-def mutated(table: Mapping[str, Any], known: Clues, other: Mapping[str, Any], draw: random.Random) -> Table:
-    """Return `table` with one to three changes; `other` is an input of which parts may be taken."""
-    found = copy.deepcopy(dict(table))
+def mutated(
+    table: Mapping[str, Any],
+    known: Clues,
+    other: Mapping[str, Any],
+    draw: random.Random,
+    changes: Sequence[Change] = (),
+) -> Table:
+    """Return `table` with one to three of `changes`, or of all; parts of `other` may be taken."""
+    found, changes = copy.deepcopy(dict(table)), changes or list(MUTATIONS)
     for _ in range(draw.choice((1, 1, 2, 3))):
-        [change] = draw.choices(list(MUTATIONS), list(MUTATIONS.values()))
+        [change] = draw.choices(changes, [MUTATIONS[one] for one in changes])
         found = change(copy.deepcopy(found), known, draw) or found
     if draw.random() < 0.1:
         part = draw.choice(("fault", "kill", "seed"))
@@ -294,7 +300,9 @@ def _retimed(table: Table, known: Clues, draw: random.Random) -> Table | None:
     return table
 
 
-MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float] = {
+Change = Callable[[Table, Clues, random.Random], Table | None]
+
+MUTATIONS: Mapping[Change, float] = {
     _seed: 2.0,
     _start: 2.0,
     _fault: 3.0,
@@ -312,6 +320,8 @@ MUTATIONS: Mapping[Callable[[Table, Clues, random.Random], Table | None], float]
     _retimed: 1.5,
 }
 """The changes of an input, and how often each is drawn."""
+WITHIN_BOUNDS: Sequence[Change] = (_seed, _start, _geometry, _size)
+"""The changes after which the computed bounds still hold."""
 
 
 def simpler(table: Table, source: Table) -> Iterator[Table]:
