@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation import gauss_newton, smoother
+from agent.estimation.compiled import address, library
 from agent.estimation.fit import Start, fits
 from agent.estimation.gauss_newton import Convergence, Fitted, Point, point_at
 from agent.estimation.gaussian.joint_ranges import PosePrior
@@ -240,6 +241,30 @@ def test_each_range_is_weighed_by_the_prediction_from_all_others() -> None:
         alone = kernel.step(walk, poses, without, 0.0, np.inf)
         error = step.multipliers[j] / (step.alone[j] - step.explained[j])
         assert error == pytest.approx(1e12 * alone.multipliers[j], rel=1e-4)
+
+
+def test_the_estimator_without_memory_raises_memory_error() -> None:
+    """No machine has the memory for these numbers of ranges, candidates and ticks."""
+    many, none = 1 << 50, address(np.zeros(0))
+    problem = problem_of(1, 1, 4, slow=0.0, survey=0.0, prior=False)
+    poses, constants, white = point_of(problem.measured, 1)
+    kernel = Kernel(problem.measured, problem.weighing)
+    walk = kernel.walked(poses, constants, white)
+    kernel._measured._obj.ranges = many  # type: ignore[attr-defined]
+    ticks = address(np.array([[0, -1, 1, many]]))
+    for without in (
+        lambda: kernel.step(walk, poses, np.ones(1), 0.0, 1.0),
+        lambda: kernel.fitted(poses, constants, white, None, Convergence(1, 1e-3, 0.0)),
+        lambda: library().anchor_guesses(
+            *(many, none, none, none, none, none, 0, none, none, 0, 1, none, 1.0, 1.0, 1.0, 1, none)
+        ),
+        lambda: library().placements(
+            *(2, 1, *[none] * 11, 0, none, many, 1, none, none, 1.0, 1.0, 1, 1.0, 1.0, 1.0, 1, none)
+        ),
+        lambda: library().detections(none, 1, ticks, none, 1, 1, none, none, none, 1.0, none, 3, none),
+    ):
+        with pytest.raises(MemoryError, match="no memory"):
+            without()
 
 
 def test_ranges_that_determine_no_pose_are_singular() -> None:

@@ -38,7 +38,16 @@ def library() -> ctypes.CDLL:
     for name, (result, arguments) in SIGNATURES.items():
         getattr(found, name).argtypes = [TYPES[one] for one in arguments]
         getattr(found, name).restype = result
+    for name in ALLOCATING:
+        getattr(found, name).errcheck = _allocated
     return found
+
+
+def _allocated(code: int, *_: object) -> int:
+    """Return what a function of C has returned. Raises MemoryError if it got no memory."""
+    if code == NO_MEMORY:
+        raise MemoryError("the estimator got no memory")
+    return code
 
 
 TYPES = {"n": ctypes.c_longlong, "d": ctypes.c_double, "a": Pointer}
@@ -51,11 +60,14 @@ SIGNATURES = {
     "anchor_guesses": (TYPES["n"], "naaaaanaannadddna"),
     "tracked": (None, "nndaaaaaa"),
     "no_detection": (TYPES["d"], "naddn"),
-    "detections": (TYPES["d"], "anaannaaadan"),
+    "detections": (ctypes.c_int, "anaannaaadana"),
     "same_poses": (None, "naaadda"),
     "placements": (TYPES["n"], "nnaaaaaaaaaaanannaaddndddna"),
 }
 """The results and the arguments of the functions of C: numbers (n), floats (d), addresses of arrays (a)."""
+ALLOCATING = ("anchor_guesses", "detections", "fitted", "gauss_newton_step", "placements")
+"""The functions of C that take memory, and return NO_MEMORY if there is none."""
+NO_MEMORY = -2
 
 
 def _no_kernel(why: str) -> NoKernel:

@@ -200,7 +200,8 @@ static void polish(const Circles *of, const Spread *spread, double most, double 
 }
 
 /* Set `points` to the likeliest anchors, of which the first `known` are given; returns their number, at most
-   `most`. `finer` are the errors (m) that are expected of them before each of the `steps`, and at the end. */
+   `most`, or -2 without memory. `finer` are the errors (m) that are expected of them before each of the `steps`,
+   and at the end. */
 Index anchor_guesses(Index count, const double *x, const double *y, const double *rho, const double *sigma,
                      const Mixture *by, Index couples, const Index *first, const Index *second, Index known,
                      Index steps, const double *finer, double longest, double unlikely, double near, Index most,
@@ -209,6 +210,7 @@ Index anchor_guesses(Index count, const double *x, const double *y, const double
     const Circles of = {count, x, y, rho, sigma};
     const Index all = crossings(&of, couples, first, second, known, points);
     double *work = malloc(sizeof(double) * (8 * count + 3 * all)), *likely = work + 8 * count, best = -INFINITY;
+    if (!work) return -2;
     double *kept = likely + all;
     Spread spread = {count, by, work + 5 * count, work + 6 * count, work + 7 * count};
     for (Index step = 0; step < steps; step++) {
@@ -359,10 +361,10 @@ static Index sorted(const Meeting *of, const Spread *spread, double unlikely, In
     return left;
 }
 
-/* Keep the likeliest in each cell of `near` m, at most `crowd`; returns their number. */
-static Index thinned(const Meeting *of, double near, Index crowd, Index count, Placed *all)
+/* Keep the likeliest in each of the cells of `near` m, at most `crowd`; returns their number. */
+static Index thinned(const Meeting *of, double near, Index crowd, Index count, Placed *all, Index (*cells)[4])
 {
-    Index kept = 0, (*cells)[4] = malloc(sizeof *cells * crowd);
+    Index kept = 0;
     for (Index n = 0; n < count && kept < crowd; n++) {
         Index *cell = cells[kept], k = 0;
         for (int a = 0; a < 2; a++) {
@@ -372,7 +374,6 @@ static Index thinned(const Meeting *of, double near, Index crowd, Index count, P
         while (k < kept && memcmp(cells[k], cell, sizeof *cells)) k++;
         if (k == kept) all[kept++] = all[n];
     }
-    free(cells);
     return kept;
 }
 
@@ -429,9 +430,9 @@ static Placed *scanned(const Meeting *of, const Circle *circle, Placed *to)
     return to;
 }
 
-/* Set `found` to the likeliest placements by the `candidates` of all `circles`, with their log-likelihoods as a last column; returns their number, at
-   most `most`, or -1 if a matrix is singular. `finer` are the errors (m) of the candidates before each of the
-   `steps`, and at the end, and `damping` those of the rotations. */
+/* Set `found` to the likeliest placements by the `candidates` of all `circles`, with their log-likelihoods as a last
+   column; returns their number, at most `most`, or -1 if a matrix is singular, or -2 without memory. `finer` are the
+   errors (m) of the candidates before each of the `steps`, and at the end, and `damping` those of the rotations. */
 Index placements(Index count, Index middle, const double *near_x, const double *near_y, const double *near_root,
                  const double *far_x, const double *far_y, const double *far_root, const double *rho,
                  const double *sigma, const Mixture *by, const double *apart, const double *lever, Index circles,
@@ -442,7 +443,9 @@ Index placements(Index count, Index middle, const double *near_x, const double *
     const Meeting of = {count, middle, {{near_x, near_y, near_root}, {far_x, far_y, far_root}}, rho, apart, lever};
     Placed *all = malloc(sizeof *all * candidates), *end = all;
     double *work = malloc(sizeof(double) * count * (UNKNOWNS + 4)), *logs = work + count * (UNKNOWNS + 1);
+    Index (*cells)[4] = malloc(sizeof *cells * crowd);
     Spread spread = {count, by, logs, logs + count, logs + 2 * count};
+    if (!all || !work || !cells) circles = 0, steps = -2;
     for (Index k = 0; k < circles; k++) end = scanned(&of, circle + k, end);
     Index left = end - all;
     for (Index step = 0; step < steps; step++) {
@@ -454,7 +457,7 @@ Index placements(Index count, Index middle, const double *near_x, const double *
                 steps = -1, left = 0;
         if (left <= crowd) continue;
         widen(&spread, sigma, finer[step + 1]);
-        left = thinned(&of, cell, crowd, sorted(&of, &spread, unlikely, left, all, work), all);
+        left = thinned(&of, cell, crowd, sorted(&of, &spread, unlikely, left, all, work), all, cells);
     }
     if (steps > 0) {
         widen(&spread, sigma, finer[steps]);
@@ -464,7 +467,8 @@ Index placements(Index count, Index middle, const double *near_x, const double *
     }
     free(all);
     free(work);
-    return steps > 0 ? left : -1;
+    free(cells);
+    return steps > 0 ? left : steps;
 }
 
 /* --- detections, and ticks without one ------------------------------------------------------------------ */
@@ -504,13 +508,14 @@ double no_detection(Index count, double *beyond, double sigma, double drop_outs,
 }
 
 /* The log-likelihood of a detection (`sign` -1) or of none (1) at each of the ticks, between the robot `first` and
-   the robot `second`, or the anchor at its pivot if that is -1; for the others, see `detections`. */
+   the robot `second`, or the anchor at its pivot if that is -1, with memory from `beyond` on; for the others, see
+   `detections`. */
 static double seen(const Detection *by, Index first, Index second, double sign, Index count, const Index *ticks,
                    Index robots, Index points, const double *paths, const double *poses, const double *pivot,
-                   double level, const double *inverse, Index width)
+                   double level, const double *inverse, Index width, double *beyond)
 {
     const Index size = second < 0 ? 2 : 3 * robots, begin = second < 0 ? 3 * first : 0;
-    double *beyond = malloc(sizeof *beyond * (count + 2 * size)), *gradient = beyond + count, *terms = gradient + size;
+    double *gradient = beyond + count, *terms = gradient + size;
     double dx = 0.0, dy = 0.0, nearest = INFINITY, weight = 0.0;
     Index worst = -1;
     for (Index k = 0; k < count; k++) {
@@ -543,26 +548,30 @@ static double seen(const Detection *by, Index first, Index second, double sign, 
         const double spread = length(sigma, by->edge * by->reach);
         weight = sign < 0.0 ? log_cdf(least / spread) : no_detection(count, beyond, spread, by->drop_outs, (Index)by->silent);
     }
-    free(beyond);
     return weight;
 }
 
-/* The log-likelihood of all `terms`: each is a first robot, a second one or -1, the sign, and the number of its ticks.
-   Those of a fit: `paths` have `points` poses each, `poses` are those at tick 0, and `level` times `inverse` is their
+/* Set `total` to the log-likelihood of all `terms`; returns -2 without memory. Each is a first robot, a second one or
+   -1, the sign, and the number of its ticks. Those of a fit: `paths` have `points` poses each, `poses` are those at tick 0, and `level` times `inverse` is their
    covariance, with rows of `width` elements. */
-double detections(const Detection *by, Index count, const Index *terms, const Index *ticks, Index robots, Index points,
-                  const double *paths, const double *poses, const double *pivot, double level, const double *inverse,
-                  Index width)
+int detections(const Detection *by, Index count, const Index *terms, const Index *ticks, Index robots, Index points,
+               const double *paths, const double *poses, const double *pivot, double level, const double *inverse,
+               Index width, double *total)
 {
-    double total = 0.0, between = 0.0;
+    Index most = 0;
+    for (Index t = 0; t < count; t++) most = terms[4 * t + 3] > most ? terms[4 * t + 3] : most;
+    double *memory = malloc(sizeof *memory * (most + 6 * robots)), between = 0.0;
+    if (!memory) return -2;
+    *total = 0.0;
     for (Index t = 0; t < count; t++, ticks += terms[3], terms += 4) {
         between += seen(by, terms[0], terms[1], (double)terms[2], terms[3], ticks, robots, points, paths, poses, pivot,
-                        level, inverse, width);
+                        level, inverse, width, memory);
         if (t + 1 < count && terms[4] == terms[0] && terms[5] == terms[1]) continue;
-        total += between;
+        *total += between;
         between = 0.0;
     }
-    return total;
+    free(memory);
+    return 0;
 }
 
 /* --- the same poses -------------------------------------------------------------------------------------- */

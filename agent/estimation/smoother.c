@@ -1166,7 +1166,7 @@ static Index sizes_of(const Measured *of, Index sizes[ARRAYS])
     return all;
 }
 
-/* Set the workspace; returns its memory, which the caller frees. */
+/* Set the workspace; returns its memory, which the caller frees, or NULL if there is none. */
 static double *workspace(const Measured *of, Work *to)
 {
     const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of), size = estimated(of), N = of->ranges;
@@ -1178,7 +1178,7 @@ static double *workspace(const Measured *of, Work *to)
     Index all = 0;
     for (int i = 0; i < count; i++) all += sizes[i];
     double *memory = malloc(sizeof(double) * (all + 1));
-    placed((double **)to, memory, sizes, count);
+    if (memory) placed((double **)to, memory, sizes, count);
     return memory;
 }
 
@@ -1212,7 +1212,7 @@ void paths(const Measured *of, const double *poses, const double *constants, con
     walked(of, poses, constants, white, &walk);
 }
 
-/* A step; returns 0 if the information of the unknowns is not positive definite. */
+/* A step; returns 0 if the information of the unknowns is not positive definite, and -2 without memory. */
 int gauss_newton_step(const Measured *of, double *walk, const double *poses, const double *variance,
                       double ridge, double largest, double *memory)
 {
@@ -1224,13 +1224,14 @@ int gauss_newton_step(const Measured *of, double *walk, const double *poses, con
     placed((double **)&from, walk, sizes + 6, 5);
     placed((double **)&to, memory, sizes + 2 * POINT, STEP);
     double *space = workspace(of, &w);
+    if (!space) return -2;
     const int found = stepping(of, &from, poses, variance, ridge, largest, &w, &to);
     free(space);
     return found;
 }
 
 /* The fit in `memory`, which has the start; until it has converged, or after a number of `steps` if a range holds a
-   coordinate. Returns 0 if it is singular. */
+   coordinate. Returns 0 if it is singular, and -2 without memory. */
 int fitted(const Measured *of, const Weighing *by, const Convergence *until, int weighed, double *memory)
 {
     Index sizes[ARRAYS];
@@ -1239,6 +1240,7 @@ int fitted(const Measured *of, const Weighing *by, const Convergence *until, int
     sizes_of(of, sizes);
     placed((double **)&to, memory, sizes, ARRAYS);
     double *space = workspace(of, &w);
+    if (!space) return -2;
     const int found = until->shortest < 0.0 ? holding(of, by, until->steps, &w, &to)
                                             : converged(of, by, until, weighed, &w, &to);
     free(space);

@@ -29,13 +29,13 @@ def detection_log_likelihoods(found: Sequence[Fit], measured: JointMeasurements)
             ticks.append(ranges.tick[ranges.to_anchors(first)])
             terms.append((first, second, -1, len(ticks[-1])))
     given = (by, len(terms), address(np.array(terms)), address(np.concatenate(ticks)))
-    weights = []
-    for one in found:
+    weights = np.empty((len(found), 1))
+    for one, weight in zip(found, weights, strict=True):
         pivot, inverse = one.problem.measured.pivot, one.linear.step.inverse
         at = [address(part) for part in (one.paths, one.start.poses, pivot)]
         fit = (len(one.paths), one.paths.shape[1], *at, one.level, address(inverse), len(inverse))
-        weights.append(library().detections(*given, *fit))
-    return weights
+        library().detections(*given, *fit, address(weight))
+    return list(weights[:, 0].tolist())
 
 
 EDGE = 0.005
