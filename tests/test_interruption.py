@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import subprocess
@@ -148,7 +149,8 @@ def test_a_command_that_is_stopped_while_it_works_says_so(
         ended = command.ended()
     assert (ended.status, ended.err) == (130, f"tandem {words[0]}: stopped by {number.name}\n")
     if "run" in words:
-        assert f'"reason": "stopped by {number.name}"' in (out / "summary.json").read_text()
+        summary = json.loads((out / "summary.json").read_text())
+        assert (summary["reason"], summary["mode"]) == (f"stopped by {number.name}", "in-process")
 
 
 def test_a_command_under_nohup_outlives_its_terminal(tmp_path: Path) -> None:

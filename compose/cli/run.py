@@ -74,7 +74,7 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
         except CannotRecord as error:
             raise not_recorded(error) from None
         except KeyboardInterrupt:
-            break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
+            break_off(options, folder, "in-process", f"stopped by {INTERRUPTION.signal_name}", began)
             raise
         stop_by_signal(inbox)
         return _finish(options, finished, folder, "in-process", began, page, inbox)
@@ -110,14 +110,14 @@ def _as_processes(
                     on_start=lambda: stop_by_signal(inbox),
                 )
         except supervisor.ChildFailed as failure:
-            break_off(options, folder, str(failure), began)
+            break_off(options, folder, "processes", str(failure), began)
             inbox.say(f"failed: {failure}")
             return FAILED
         except KeyboardInterrupt:
-            break_off(options, folder, f"stopped by {INTERRUPTION.signal_name}", began)
+            break_off(options, folder, "processes", f"stopped by {INTERRUPTION.signal_name}", began)
             raise
         except Interrupted as signal_name:
-            break_off(options, folder, f"stopped by {signal_name}", began)
+            break_off(options, folder, "processes", f"stopped by {signal_name}", began)
             inbox.say(f"stopped by {signal_name}")
             return STOPPED_STATUS
         for kill in spared:

@@ -93,7 +93,7 @@ def _run(
     except (Interrupted, NoRouter) as stop:
         if not options.launched:
             reason = f"stopped by {stop}" if isinstance(stop, Interrupted) else str(stop)
-            break_off(options, folder, reason, began)
+            break_off(options, folder, "processes", reason, began)
         raise
     if options.launched:  # the launcher prints the outcome
         return ENDED

@@ -80,13 +80,13 @@ def concluded(
             progress.result(result, getattr(options, "rate", None))
 
 
-def break_off(options: argparse.Namespace, folder: Path, reason: str, began: float) -> None:
+def break_off(options: argparse.Namespace, folder: Path, mode: Mode, reason: str, began: float) -> None:
     """Write the derived files of a recording that breaks off, if `--out` is given and it is readable."""
     if options.out is None:
         return
     with suppress(OSError, ValueError):
         recording = run.read(folder)
-        result = summary(recording, "processes", round(time.perf_counter() - began, 6))
+        result = summary(recording, mode, round(time.perf_counter() - began, 6))
         leave(recording, result | {"reason": reason}, folder)
 
 
