@@ -28,7 +28,7 @@ RESULT_COLUMNS = (TICK_COLUMN, TRUTH, TRUTH_AT_CLAIM, ESTIMATE, ERROR, SIGMA, RA
 """All columns: in a group, robots drive on after their claims; SIGMA and LATE are not shown if empty."""
 NARROWER: tuple[tuple[str, ...], ...] = ((), (TRUTH, TRUTH_AT_CLAIM), (ESTIMATE,), (RANGES, REPORTS))
 """The columns that are left out one after the other until the table fits."""
-LISTED = 4
+MOST_ROBOTS_AS_LIST = 4
 """The largest number of robots that are shown as a list if the table of all columns does not fit."""
 MOST_NAMED_ROBOTS = 10
 """The largest number of robots named in a sentence."""
@@ -51,7 +51,7 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
         cells = {name: _cells(robot, columns) for name, robot in robots.items()}
         rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
         made = tables.table(["robot"], columns, rows)
-        if len(robots) <= LISTED or tables.fits(tables.lines(made)):
+        if len(robots) <= MOST_ROBOTS_AS_LIST or tables.fits(tables.lines(made)):
             lines = tables.shown(["robot"], columns, rows)
             break
     else:
