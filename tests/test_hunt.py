@@ -17,20 +17,22 @@ import pytest
 from agent.estimation import claim
 from agent.planning import phase3_last_manoeuvre
 from agent.process.node import AgentProcess
+from compose.audit import rules
 from compose.cli import hunt as command
 from compose.cli.main import parse
 from compose.launch import in_process, virtual_processes
+from compose.recording.run import of_frames
 from compose.scenario.kills import KILL_POINTS
 from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.hunt import coverage
+from compose.sweep.hunt import coverage, examination
 from compose.sweep.hunt.examination import MOST_TICKS, MOST_WITHOUT_END, examined, scenario_of, watched
 from compose.sweep.hunt.exploration import Hunt
 from compose.sweep.hunt.mutation import fault_lines, simpler
 from compose.sweep.hunt.mutation import seeds as hunted
-from protocol.journal.journal_file import MemoryJournal, packed
+from protocol.journal.journal_file import CorruptJournal, MemoryJournal, packed
 from protocol.messages import Observation
 from tests.commands import TandemProcess, tandem
 from tests.test_safety_distance import NEAR
@@ -100,6 +102,25 @@ def test_an_input_reaches_the_same_after_another_one(monkeypatch: pytest.MonkeyP
     alone = examined(scenario_table("paper-1"))
     examined(scenario_table("noisy"))
     assert examined(scenario_table("paper-1")) == alone
+
+
+@pytest.mark.parametrize(
+    ("module", "name", "kind"),
+    [
+        (in_process, "played", "a process dies"),
+        (examination, "of_frames", "the recording is misread"),
+        (rules, "audit_run", "the recording is misread"),
+    ],
+)
+def test_a_mistake_of_a_reader_is_not_reported_as_a_process_that_dies(
+    module: object, name: str, kind: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(*_: object, **__: object) -> None:
+        raise CorruptJournal("it ends within a frame")
+
+    monkeypatch.setattr(module, name, broken)
+    (breach,) = examined(scenario_table("paper-1")).breaches
+    assert (breach.kind, breach.what) == (kind, "CorruptJournal: it ends within a frame")
 
 
 def test_the_parts_of_an_input_are_left_out_one_after_the_other() -> None:
@@ -189,7 +210,9 @@ def test_every_task_condition_and_kind_of_message_is_reached_in_some_mission(
         scenario, _, _ = scenario_of(table)
         if scenario.max_ticks * len(scenario.robots) <= MOST_TICKS:
             with suppress(coverage.TooLongError):
-                seen |= coverage.reached(watched(scenario, seen)[0])[0]
+                sinks, messages = watched(scenario, seen)
+                run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
+                seen |= coverage.reached(run)[0]
             left = coverage.never(seen)
         if not (left["tasks"] or left["messages"] or {*left["conditions"]} - GUARDS):
             break

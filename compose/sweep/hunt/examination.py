@@ -59,28 +59,35 @@ def examined(table: dict[str, Any]) -> Examined:
         return Examined(refused="it could last too long")
     seen: set[str] = set()
     try:
-        run, sinks = watched(scenario, seen)
+        sinks, messages = watched(scenario, seen)
     except TooLongError:
         return Examined(refused="it lasts too long")
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
     again = _again(scenario, kills, clocks, sinks)
-    found, moments = reached(run)
-    every = [*again, *breaches(run, replayed=not again)]
+    try:
+        run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
+        found, moments = reached(run)
+        every = [*again, *breaches(run, replayed=not again)]
+    except Exception as error:  # noqa: BLE001  # nor a reader of the recording, or a rule of the audit
+        return Examined((*again, Breach("the recording is misread", f"{type(error).__name__}: {error}")))
     ids = tuple([one.id for one in scenario.robots])
     found |= seen | {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
     shares = tuple([one.ticks / one.bound for one in bounded(run) if one.ticks is not None])
     return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments), shares)
 
 
-def watched(scenario: Scenario, seen: set[str]) -> tuple[Run, dict[str, MemoryJournal]]:
-    """Return a run of `scenario` in this process with its journals; `seen` are the conditions not met."""
+def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal], EncodedMessages]:
+    """Return the journals of a run of `scenario` in this process, and its messages by their frames.
+
+    `seen` are the conditions not met.
+    """
     last = math.inf if guaranteed(scenario) else MOST_WITHOUT_END
     sinks, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
     in_process.played(
         scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen, last)), messages.encode
     )
-    return of_frames({name: one.frames for name, one in sinks.items()}, messages=messages), sinks
+    return sinks, messages
 
 
 def _task(run: Run, kill: Kill) -> str:
