@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
+import random
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 from mcap.writer import Writer
+
+from protocol.motion import Controls, Pose, step
 
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
 TABLES = {
@@ -53,3 +57,24 @@ def written_mcap(path: Path, tables: Tables, encoding: str = "json") -> Path:
                 writer.add_message(channel, 0, json.dumps(row).encode(), 0)
         writer.finish()  # type: ignore[no-untyped-call]
     return path
+
+
+def circling(duration_s: float) -> dict[str, list[dict[str, object]]]:
+    """Return the tables of a robot that circles among four anchors, with two ranges to each in a second."""
+    anchors, draw, period = (
+        {"A": (0.0, 0.0), "B": (10.0, 0.0), "C": (10.0, 10.0), "D": (0.0, 10.0)},
+        random.Random(1),
+        0.1,
+    )
+    tables: dict[str, list[dict[str, object]]] = {"odometry": [], "ranges": []}
+    tables["anchors"] = [{"anchor": name, "x": x, "y": y} for name, (x, y) in anchors.items()]
+    pose, controls = Pose(5.0, 2.0, 0.3), Controls(0.6, 0.25)
+    for k in range(round(duration_s / period)):
+        ends = {"t0": round(k * period, 3), "t1": round((k + 1) * period, 3)}
+        moved = {"dx": controls.v * period, "dy": 0.0, "dheading": controls.omega * period}
+        tables["odometry"].append({"robot": "r", **ends, **moved})
+        pose = step(pose, controls.v, controls.omega, period)
+        for name, place in anchors.items() if k % 5 == 0 else ():
+            rho = round(math.dist((pose.x, pose.y), place) + draw.gauss(0.0, 0.05), 4)
+            tables["ranges"].append({"t": ends["t1"], "from": "r", "to": name, "range": rho, "sigma": 0.05})
+    return tables

@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 
 import pytest
+from msgspec.structs import replace
 
 from compose.cli import estimate as estimate_command
 from compose.cli.commands import COMMANDS
@@ -25,8 +26,9 @@ from compose.view.epochs import write_player
 from compose.view.played_estimate import PLAYER_JSON, read_player
 from compose.view.recorded import scenes as recorded_scenes
 from protocol.motion import travelled
+from tandem import estimate
 from tests.commands import tandem
-from tests.range_tables import SAMPLE
+from tests.range_tables import SAMPLE, circling, written_csv
 from tests.test_estimate import sample_estimates
 
 
@@ -146,6 +148,35 @@ def test_anchors_with_a_sigma_are_estimated_and_written_as_the_next_estimate_rea
     for true in sample.anchors:
         position = summary["anchors"][true.id]["position"]
         assert math.dist(position, (true.x, true.y)) < 0.4
+
+
+def test_ranges_that_no_radio_can_have_cost_no_claim(tmp_path: Path) -> None:
+    tables = circling(12.0)
+    for row in [row for row in tables["ranges"] if row["to"] == "B"][8:14]:
+        row["range"] = 1e7
+    found = estimate(written_csv(tmp_path, tables))
+    assert found.summary.blocking_reason == ""
+    assert found.rows["claim"][found.rows["t_s"] > 4.0].all()
+
+
+def test_the_doubtful_estimate_of_an_anchor_is_not_called_elsewhere_than_surveyed(tmp_path: Path) -> None:
+    tables = circling(5.0)
+    tables["anchors"][3] = {"anchor": "D", "x": "", "y": ""}
+    found, why = estimate(written_csv(tmp_path, tables)), "8 of 12 of its ranges fit no other"
+    summary = replace(found.summary, doubtful_anchors={"A": why, "D": why})
+    lines = estimate_command._lines(found.problem, found.result._replace(summary=summary))
+    assert [line for line in lines if why in line] == [
+        f"anchor A seems to stand elsewhere than surveyed: {why}",
+        f"anchor D has a doubtful estimate: {why}",
+    ]
+
+
+def test_an_anchor_that_two_ranges_do_not_locate_has_no_place_in_a_relative_frame(tmp_path: Path) -> None:
+    tables = circling(8.0)
+    tables["ranges"] = [row for row in tables["ranges"] if row["to"] == "A"][:2]
+    found = estimate(written_csv(tmp_path, tables), relative="r")
+    assert (found.summary.anchors, found.summary.unverified_anchors) == ({}, {})
+    assert found.summary.blocking_reason == "r: 0 of 8 required ranges from different places"
 
 
 @pytest.mark.parametrize(

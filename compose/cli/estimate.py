@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import math
 import sys
 from collections.abc import Iterator
 from functools import partial
@@ -138,8 +139,10 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
     for name, anchor in summary.anchors.items():
         x, y = anchor.position
         found.append(f"anchor {name}: {x:.2f} {y:.2f}, with a sigma of {anchor.sigma:.2f} m")
+    surveyed = {one.id: one.sigma < math.inf for one in problem.anchors}
     for name, why in summary.doubtful_anchors.items():
-        found.append(f"anchor {name} seems to stand elsewhere than surveyed: {why}")
+        what = "seems to stand elsewhere than surveyed" if surveyed[name] else "has a doubtful estimate"
+        found.append(f"anchor {name} {what}: {why}")
     found += [f"anchor {name}: {why}" for name, why in summary.unverified_anchors.items()]
     if summary.blocking_reason:
         found.append(f"no claim at the end: {summary.blocking_reason}")

@@ -71,9 +71,11 @@ def displacements(fit: Fit, used: JointMeasurements) -> Iterator[Displacement]:
 
     The position of each in turn is estimated as if it were not known: then its ranges are no strays, and do
     not raise the noise level. The length in sigmas is the lesser one by the covariance there and the misfit
-    at the told position: where a few ranges admit two places, that covariance is small, too.
+    at the told position: where a few ranges admit two places, that covariance is small, too. An anchor
+    without ranges is left out.
     """
-    for name in used.anchors:
+    ends = [used.radios[one] for one in np.unique(used.ranges.radio).tolist()]
+    for name in [one for one in used.anchors if one in used.robots or any(one in each for each in ends)]:
         measured, k, told = _estimating(name, used)
         if told.sigma == math.inf:
             continue

@@ -190,7 +190,7 @@ class EstimateSummary(msgspec.Struct, frozen=True):
     anchors: dict[str, EstimatedAnchor]
     """The estimated positions of anchors that are not surveyed; those of which none follows are left out."""
     doubtful_anchors: dict[str, str]
-    """The anchors that seem to stand elsewhere than the recording says, with the reason."""
+    """The anchors that seem to stand elsewhere than the recording or the estimate says, with the reason."""
     unverified_anchors: dict[str, str]
     """The anchors of which no range tells whether they stand as far off as `accuracy`, with the direction."""
 

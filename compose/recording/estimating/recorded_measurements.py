@@ -56,10 +56,17 @@ With it, rounding the times of ranges adds at most 1 % to their sigma.
 """
 
 HORIZON = 1.25
-"""The assumed sensing range, as a multiple of the longest range so far.
+"""The assumed sensing range, as a multiple of the longest possible range so far.
 
 A missing range of a recording says nothing, so that this only scales the tolerances of the search. With 1,
 the estimator would take it for information that no range is longer.
+"""
+
+POSSIBLE = 2.0
+"""The longest possible range, as a multiple of the largest median of two radios and the ways of two robots.
+
+A range of two radios differs from any other one by at most the way that they drive in between. A range beyond
+twice that is an outlier under any guess; as the longest range, it would scale all tolerances.
 """
 
 MOST_USED_ANCHORS = 32
@@ -123,8 +130,19 @@ class Measurements(msgspec.Struct, frozen=True, kw_only=True):
     def until(self, epoch: int) -> JointMeasurements:
         """Return what was measured up to the end of `epoch`, from 0 on; see HORIZON."""
         known = self.joint.until((epoch + 1) * self.ticks_per_epoch)
-        reach = HORIZON * max(float(np.max(known.ranges.rho, initial=0.0)), SIGMA_FLOOR)
-        return known.thinned(reach)
+        return known.thinned(HORIZON * max(longest_possible(known), SIGMA_FLOOR))
+
+
+def longest_possible(known: JointMeasurements) -> float:
+    """Return the longest range (m) that its radios may have, 0 without ranges; see POSSIBLE."""
+    rho = known.ranges.rho
+    medians = [
+        float(np.partition(own, (len(own) - 1) // 2)[(len(own) - 1) // 2])
+        for own in map(rho.__getitem__, known.ranges.pairs)
+    ]
+    ways = sorted([float(np.sum(np.abs(path.v))) * known.period for path in known.paths])
+    most = POSSIBLE * (max(medians, default=0.0) + sum(ways[-2:]))
+    return float(np.max(rho, initial=0.0, where=rho <= most))
 
 
 @contextmanager
