@@ -28,6 +28,7 @@ from compose.recording.estimating.radio_errors import PairErrors, range_calibrat
 from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.ranging.range_recording import Numbers, RangeRecording, TruePath
 from protocol.noise import Noise
+from tandem import estimate
 from tests.commands import tandem
 from tests.range_tables import SAMPLE
 from tests.test_cases_estimates import CASES
@@ -255,7 +256,16 @@ def test_biases_and_scales_that_no_radio_has_are_refused(
     )
     ended = tandem("estimate", SAMPLE, "--noise", "it.toml", cwd=tmp_path)
     assert (ended.status, ended.err.count("\n")) == (USER_ERROR, 1)
-    assert f"[calibration] range_bias has {says}" in ended.err
+    assert f"[calibration] {'range_scale' if scale else 'range_bias'} has {says}" in ended.err
+
+
+@pytest.mark.parametrize("field", ["range_bias", "range_scale", "pairs.A-B"])
+def test_a_calibration_with_a_number_that_is_none_is_refused(field: str, tmp_path: Path) -> None:
+    (tmp_path / "it.toml").write_text(f"[mission.noise]\n[calibration]\n{field} = nan\n")
+    with pytest.raises(
+        UserError, match=rf"\[calibration\] {field.removeprefix('pairs.')} has a \w+ of \+nan"
+    ):
+        estimate(SAMPLE, noise=tmp_path / "it.toml")
 
 
 def test_stamps_that_are_all_equal_are_refused(tmp_path: Path) -> None:

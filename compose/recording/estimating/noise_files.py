@@ -62,8 +62,9 @@ class RangeCorrection(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         """
         ranges = recording.ranges
         longest = float(np.max(ranges.range, initial=0.0))
-        for name, value in {"range_bias": self.range_bias, **self.pairs}.items():
-            if why := absurd_error(value, self.range_scale, longest):
+        errors = {"range_bias": (self.range_bias, 0.0), "range_scale": (0.0, self.range_scale)}
+        for name, error in {**errors, **{pair: (value, 0.0) for pair, value in self.pairs.items()}}.items():
+            if why := absurd_error(*error, longest):
                 raise UserError(f"--noise: [calibration] {name} has {why}")
         bias = np.full(len(ranges.t), self.range_bias)
         for (first, second), rows in recording.pairs().items():

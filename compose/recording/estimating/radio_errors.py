@@ -134,9 +134,9 @@ class RangeCalibration(NamedTuple):
 def absurd_error(bias: float, scale: float, longest: float) -> str:
     """Return which of these, a bias (m) or a scale, no radio has whose ranges are up to `longest` (m)."""
     most = max(MOST_BIAS, MOST_BIAS_SHARE * longest)
-    if abs(bias) > most:
+    if not abs(bias) <= most:  # it may be NaN
         return f"a bias of {bias:+.4g} m, and at most {most:.4g} m are taken for one of radios"
-    if abs(scale) > MOST_SCALE:
+    if not abs(scale) <= MOST_SCALE:
         return f"a scale of {scale:+.4g}, and at most {MOST_SCALE:g} is taken for one of radios"
     return ""
 
