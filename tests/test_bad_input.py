@@ -469,6 +469,8 @@ def test_an_agents_journal_is_never_overwritten(tmp_path: Path) -> None:
         ("figures x --size y", "tandem figures: unrecognized arguments: --size y"),
         ("estimate x --nois uwb", "unrecognized arguments: --nois uwb; did you mean '--noise'?"),
         ("run random --faul loss=0.1", "unrecognized arguments: --faul loss=0.1; did you mean '--fault'?"),
+        ("run paper-1 --kill=--", "tandem run: argument --kill: '--' is not a value"),
+        ("sweep noise --print-trial=--", "tandem sweep: argument --print-trial: '--' is not a value"),
         ("figures x --only encunter", "; did you mean 'encounter'?"),
         ("run paper-1 --kill wolrd@3", "; did you mean 'world'?"),
         ("robot robot2 --mission FILE --driver docs.rover:Rover", "; did you mean 'robot-2'?"),

@@ -51,6 +51,9 @@ class CommandParser(argparse.ArgumentParser):
 
     def parse_all(self, words: Sequence[str]) -> argparse.Namespace:
         """Return the options in `words`; end the process if a word has no meaning."""
+        for word in words:
+            if word.startswith("--") and word.endswith("=--"):  # argparse takes it for no value
+                self.error(f"argument {word.removesuffix('=--')}: '--' is not a value")
         options, unknown = self.parse_known_args(words)
         if unknown:
             self.refuse(unknown)
