@@ -26,7 +26,7 @@ from compose.recording.ranging.range_mcap import rows_as_they_arrive
 from compose.recording.ranging.range_recording import RangeRecording
 from protocol.motion import Pose, compose
 from tests.commands import tandem
-from tests.range_tables import SAMPLE
+from tests.range_tables import SAMPLE, circling
 from tests.test_house import HOUSE
 
 PROFILE = "uwb-calibrated"
@@ -220,6 +220,25 @@ def test_a_stream_is_ended_by_ctrl_c_and_by_the_end_of_its_reader_and_the_files_
         errors = process.stderr.read().decode()
     assert "Traceback" not in errors, errors
     assert (tmp_path / "found" / "estimate.json").exists()
+
+
+def test_the_estimates_before_a_wrong_row_of_a_stream_are_written(tmp_path: Path) -> None:
+    tables = circling(3.0)
+    rows = [(-1.0, "/anchors", row) for row in tables["anchors"]]
+    rows += sorted(
+        [
+            (float(str(row[stamp])), f"/{name}", row)
+            for name, stamp in (("ranges", "t"), ("odometry", "t1"))
+            for row in tables[name]
+        ],
+        key=lambda one: (one[0], one[1] != "/ranges"),
+    )
+    (tmp_path / "back.mcap").write_bytes(written([*rows, rows[10]]))
+    ended = tandem("estimate", "back.mcap", "--follow", "--out", "found", cwd=tmp_path)
+    assert (ended.status, ended.err.count("\n")) == (USER_ERROR, 1)
+    assert ended.err.endswith("; the estimates before that are in found\n")
+    assert ended.out.count("\n") > 2
+    assert (tmp_path / "found" / "estimate.csv").read_text() == ended.out
 
 
 @pytest.mark.parametrize(

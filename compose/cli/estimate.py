@@ -100,6 +100,11 @@ def _followed(
             return *estimate.result(), BROKEN_PIPE
         except KeyboardInterrupt:
             return *estimate.result(), STOPPED_STATUS
+        except UserError as error:
+            if options.out is None or not printed:
+                raise
+            _written(options.out, *estimate.result())
+            raise UserError(f"{error}; the estimates before that are in {options.out}") from None
     return *estimate.result(), None
 
 
