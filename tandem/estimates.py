@@ -141,6 +141,14 @@ def estimate(
         raise UserError(f"accuracy: {accuracy} is not a positive number")
     if not 0.5 <= confidence < 1.0:
         raise UserError(f"confidence: {confidence} is not a probability from 0.5 to below 1")
+    if window is not None:
+        try:
+            begin, end = map(float, window)
+        except (TypeError, ValueError):
+            raise UserError(f"window: {window!r} is not the begin and the end of an interval in s") from None
+        if not begin < end:
+            raise UserError(f"window: {begin:g} s is not before {end:g} s")
+        window = begin, end
     guarded = GuardedSolver(solver) if solver is not None else None
     if isinstance(recording, Run):
         if anchors is not None:

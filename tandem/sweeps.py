@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from compose.cli.arguments import MOST_WORKERS
 from compose.errors import UserError
 from compose.extras import need
 from compose.launch.class_loader import need_module
@@ -119,9 +120,7 @@ def sweep(
     need("distributed", "matplotlib", "pyarrow", "tomli_w")
     from compose.sweep import execution  # noqa: PLC0415  # slow to import, and optional
 
-    options = execution.ExecutionOptions(processes=processes, audit=audit)
-    if workers is not None:
-        options = msgspec.structs.replace(options, workers=workers)
+    options = _with_workers(execution.ExecutionOptions(processes=processes, audit=audit), workers)
     found = _sweep_of(base, axes, trials, seed, paired)
     with folder_for(None if out is None else Path(out)) as folder:
         return _results(_run(found, folder, options, visible=progress), kept=out is not None)
@@ -153,9 +152,7 @@ def arena(
     from compose.sweep import arena as found  # noqa: PLC0415  # slow to import, and optional
     from compose.sweep.execution import ExecutionOptions  # noqa: PLC0415  # likewise
 
-    options = ExecutionOptions(audit=False)
-    if workers is not None:
-        options = msgspec.structs.replace(options, workers=workers)
+    options = _with_workers(ExecutionOptions(audit=False), workers)
     given: Any = scenarios if isinstance(scenarios, list | tuple) else [scenarios]
     names = plain([planners] if isinstance(planners, str | type) else planners or [])
     for name in names:
@@ -165,6 +162,15 @@ def arena(
         rows, results = found.run(sweeps, folder, lambda one, to: _run(one, to, options, visible=progress))
     _check_complete(results[-1], kept=out is not None)
     return Table({name: _array([row[name] for row in rows]) for name in rows[0]})
+
+
+def _with_workers(options: ExecutionOptions, workers: int | None) -> ExecutionOptions:
+    """Return `options` with this number of workers; None leaves them. Raises UserError."""
+    if workers is None:
+        return options
+    if not isinstance(workers, int) or not 1 <= workers <= MOST_WORKERS:
+        raise UserError(f"workers: {workers!r} is not a whole number from 1 to {MOST_WORKERS}")
+    return msgspec.structs.replace(options, workers=workers)
 
 
 def _sweep_of(

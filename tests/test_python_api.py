@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import doctest
+import math
 import re
 import subprocess
 import sys
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from statistics import median
@@ -441,6 +443,13 @@ def test_a_mistake_in_a_sweep_is_one_line() -> None:
             tandem.sweep(*arguments)
 
 
+@pytest.mark.parametrize("workers", [0, -1, 10**30, 1.5, "3"])
+@pytest.mark.parametrize("of", [tandem.sweep, tandem.arena])
+def test_a_number_of_workers_that_no_machine_has_is_refused(of: Callable[..., object], workers: Any) -> None:
+    with pytest.raises(tandem.UserError, match=f"^workers: {workers!r} is not a whole number from 1"):
+        of("random", workers=workers)
+
+
 def test_importing_tandem_imports_no_other_package() -> None:
     code = (
         "import sys; before = {*sys.modules}; import tandem; "
@@ -487,6 +496,12 @@ def test_a_run_and_its_recording_have_the_same_estimates(tmp_path: Path) -> None
         ({"accuracy": 0.0}, "accuracy: 0.0 is not a positive number"),
         ({"confidence": 1.0}, "confidence: 1.0 is not a probability from 0.5 to below 1"),
         ({"robots": ["C"]}, "has no robot C; it has A, B"),
+        ({"robots": []}, "--robots: it names no robot"),
+        ({"robots": ["A", "A"]}, "--robots: it names a robot twice"),
+        ({"window": (1.0,)}, "window: (1.0,) is not the begin and the end of an interval in s"),
+        ({"window": 3.0}, "window: 3.0 is not the begin and the end of an interval in s"),
+        ({"window": (5.0, 1.0)}, "window: 5 s is not before 1 s"),
+        ({"window": (0.0, math.nan)}, "window: 0 s is not before nan s"),
         ({"noise": "uwbb"}, "uwbb"),
     ],
 )

@@ -33,7 +33,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--days": arguments.up_to(36_500),
     "--format": FIGURE_FORMATS,
     "--clock": arguments.clock,
-    "--jobs": arguments.up_to(1000),
+    "--jobs": arguments.up_to(arguments.MOST_WORKERS),
     "--kill": arguments.kill,
     "--model": arguments.model,
     "--only": PICTURES,
@@ -49,7 +49,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--seed": arguments.natural,
     "--trials": arguments.up_to(10**7),
     "--window": arguments.window,
-    "--workers": arguments.up_to(1000),
+    "--workers": arguments.up_to(arguments.MOST_WORKERS),
 }
 """The functions that turn the texts of arguments into values, or their choices; all others are texts."""
 

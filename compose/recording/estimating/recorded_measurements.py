@@ -169,6 +169,8 @@ def chosen_part(
     for name in robots or ():
         if name not in known:
             raise UserError(f"--robots: {recording.source} has no robot {name}; it has {', '.join(known)}")
+    if robots is not None and not 0 < len(robots) == len(set(robots)):
+        raise UserError(f"--robots: it names {'a robot twice' if robots else 'no robot'}")
     lasts = end - begin
     if window is not None:
         begin, end = begin + window[0], min(begin + window[1], end)
