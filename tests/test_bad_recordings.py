@@ -30,7 +30,7 @@ def changed(table: str, row: int, **fields: object) -> Tables:
 INVALID: list[tuple[str, int, dict[str, object], str]] = [
     ("odometry", 1, {"dx": "fast"}, "dx: expected a number, got 'fast'"),
     ("odometry", 1, {"dx": "nan"}, "dx: expected a number, got 'nan'"),
-    ("odometry", 1, {"t0": "2e12"}, "t0: expected a number <= 1000000000000.0, got '2e12'"),
+    ("odometry", 1, {"t0": "2e12"}, "t0: expected a number <= 1000000000000.0 (a time in s), got '2e12'"),
     ("odometry", 0, {"t1": -0.5}, "t1: -0.5 s is before t0, 0 s"),
     ("odometry", 2, {"t0": 0.25}, "t0: it starts at 0.25 s, and the increment of a before it ends at 0.5 s"),
     ("odometry", 1, {"robot": "b/c"}, "robot: expected a name of letters, digits, - and _, got 'b/c'"),
@@ -42,7 +42,8 @@ INVALID: list[tuple[str, int, dict[str, object], str]] = [
         "ranges",
         1,
         {"from": "M12"},
-        "M12 is neither a robot with odometry nor a known anchor; did you mean 'M1'?",
+        "M12 is neither a robot with odometry nor a known anchor; robots: a, b; anchors: M1; "
+        "did you mean 'M1'?",
     ),
     ("ranges", 1, {"to": "M1"}, "it is a range from M1 to itself"),
     ("ranges", 1, {"from": "b"}, "t: it is of 0.2 s, and the range between b and a before it is of 0.3 s"),
@@ -104,11 +105,12 @@ def test_an_invalid_graph_is_one_line_with_its_place(text: str, says: str, tmp_p
     [
         (
             "t,from,to,rnage",
-            "unknown column 'rnage'; it has t, from, to, range, sigma; did you mean 'range'?",
+            "unknown column 'rnage'; there may be t, from, to, range, sigma; the column range is missing; "
+            "did you mean 'range'?",
         ),
         ("t,from,to", "the column range is missing"),
         ("t,t,from,to,range", "there are two columns t"),
-        ("", "the column t is missing"),
+        ("", "the columns t, from, to, range are missing"),
     ],
 )
 def test_a_wrong_head_of_a_table_is_refused(head: str, says: str, tmp_path: Path) -> None:
@@ -168,7 +170,7 @@ def test_names_of_robots_and_anchors_do_not_overlap(tmp_path: Path) -> None:
 def test_columns_that_semicolons_separate_are_named(tmp_path: Path) -> None:
     folder = written_csv(tmp_path, TABLES)
     (folder / "ranges.csv").write_text("t;from;to;range\n0;a;M1;2.5\n")
-    assert refused(folder).endswith("it has t, from, to, range, sigma; commas separate columns")
+    assert refused(folder).endswith("there may be t, from, to, range, sigma; commas separate columns")
 
 
 POSE: dict[str, object] = {"robot": "a", "t": 0, "x": 1, "y": 2, "heading": 3}

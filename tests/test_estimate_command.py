@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import re
 from pathlib import Path
 
 import pytest
@@ -126,6 +127,24 @@ def test_without_truth_there_are_no_errors(tmp_path: Path) -> None:
     with (tmp_path / "estimate.csv").open() as file:
         rows = list(csv.DictReader(file))
     assert {row["nees"] for row in rows} == {""}
+
+
+@pytest.mark.parametrize("until_s", [-1.0, 20.0])
+def test_ranges_of_other_times_than_the_odometry_are_named(until_s: float, tmp_path: Path) -> None:
+    edges = [line.split() for line in SAMPLE.read_text().splitlines()]
+    ranges = [words for words in edges if words[0] == "EDGE_RANGE"]
+    late = [words for words in ranges if float(words[1]) - float(edges[0][1]) > until_s]
+    for words in late:
+        words[1] = str(float(words[1]) + 1.7e9)
+    (tmp_path / "late.pyfg").write_text("\n".join([" ".join(words) for words in edges]))
+    ended = tandem("estimate", "late.pyfg", cwd=tmp_path)
+    if len(late) < len(ranges):
+        (unused,) = re.findall(r"(\d+) ranges not used: without odometry of all robots", ended.out)
+        assert 0 <= int(unused) - len(late) < 10, "a few are of the seconds before and after"
+    else:
+        assert ended.status == USER_ERROR
+        assert "late.pyfg: ranges are of 17000" in ended.err
+        assert "stamps have to be in s, on one clock" in ended.err
 
 
 def test_anchors_with_a_sigma_are_estimated_and_written_as_the_next_estimate_reads_them(

@@ -424,8 +424,42 @@ def test_headings_in_degrees_are_named(headings: str, tmp_path: Path) -> None:
     read_ranges(written_csv(tmp_path / "rad", tables))
     tables["poses"] = [row | {"heading": math.degrees(float(str(row["heading"])))} for row in rows]
     said = refused(written_csv(tmp_path / "degrees", tables))
-    what = "the headings of a agree with its motion only as degrees"
-    assert said == f"{tmp_path}/degrees: {what}: are they in degrees? They have to be in rad"
+    what = "the headings of a agree with its motion only as degrees: are they in degrees"
+    assert said == f"{tmp_path}/degrees: {what}? They have to be in rad, counter-clockwise"
+
+
+@pytest.mark.parametrize("degrees", [False, True])
+@pytest.mark.parametrize("exchanged", ["headings", "x and y"])
+def test_headings_of_a_compass_are_named(exchanged: str, degrees: bool, tmp_path: Path) -> None:
+    rows = track(headings="unwrapped", begin=Pose(4.0, -7.0, 3.0))
+    tables: dict[str, list[dict[str, object]]] = {
+        "anchors": TABLES["anchors"],
+        "ranges": TABLES["ranges"][1:],
+    }
+    for row in rows:
+        if exchanged == "headings":
+            row["heading"] = math.pi / 2.0 - float(str(row["heading"]))
+        else:
+            row["x"], row["y"] = row["y"], row["x"]
+        if degrees:
+            row["heading"] = math.degrees(float(str(row["heading"])))
+    said = refused(written_csv(tmp_path, tables | {"poses": rows}))
+    assert "agree with its motion only " + ("as degrees, clockwise: " if degrees else "clockwise: ") in said
+    assert said.endswith("? They have to be in rad, counter-clockwise")
+
+
+@pytest.mark.parametrize("unit", [1e3, 1e6])
+def test_times_in_ms_are_named(unit: float, tmp_path: Path) -> None:
+    rows = track(headings="unwrapped", begin=ORIGIN)
+    tables = {"poses": [row | {"t": unit * float(str(row["t"]))} for row in rows]}
+    tables |= {"anchors": TABLES["anchors"], "ranges": TABLES["ranges"][1:]}
+    assert refused(written_csv(tmp_path, tables)).endswith("are times in ms? They have to be in s")
+
+
+def test_a_folder_with_ranges_and_without_odometry_names_the_files_it_needs(tmp_path: Path) -> None:
+    written_csv(tmp_path, {"ranges": TABLES["ranges"], "anchors": TABLES["anchors"]})
+    needs = "poses.csv, odometry.csv, or poses-ROBOT.tum of each robot"
+    assert refused(tmp_path) == f"{tmp_path}: it has no odometry: {needs}"
 
 
 def test_a_tum_file_gives_the_poses_of_a_csv_file(tmp_path: Path) -> None:

@@ -26,6 +26,7 @@ from compose.recording.ranging.range_recording import RecordedRobot
 from compose.recording.reasons import listed
 from compose.recording.recording_files import make_folder
 from compose.terminal.outcome import counting
+from compose.terminal.progress import unverified
 from compose.terminal.tables import shown
 from compose.terminal.text_width import tell
 from compose.view.epochs import write_player
@@ -148,9 +149,11 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
     for name, why in summary.doubtful_anchors.items():
         what = "seems to stand elsewhere than surveyed" if surveyed[name] else "has a doubtful estimate"
         found.append(f"anchor {name} {what}: {why}")
-    found += [f"anchor {name}: {why}" for name, why in summary.unverified_anchors.items()]
+    if summary.unverified_anchors:
+        found.append(unverified([*summary.unverified_anchors], "estimate.json"))
     if summary.blocking_reason:
         found.append(f"no claim at the end: {summary.blocking_reason}")
+    found.append(f"{sum(summary.ranges.values())} ranges used")
     for why, count in summary.unused_ranges.items():
         found.append(f"{count} {'range' if count == 1 else 'ranges'} not used: {why}")
     for robot in problem.robots:

@@ -67,7 +67,7 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
         say(*text_width.wrapped(_missed(late, summary["ticks"], rate)))
     claiming = [set(one["unverified_anchors"] or ()) for one in robots.values() if one["localised"]]
     if claiming and (anchors := sorted(set.intersection(*claiming))):
-        say(*text_width.wrapped(_unverified(anchors)))
+        say(*text_width.wrapped(unverified(anchors, "summary.json")))
 
 
 def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) -> str:
@@ -87,11 +87,14 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
     return f"all robots but {listed(left, MOST_NAMED_ROBOTS)} were localised by tick {last}; {bound}"
 
 
-def _unverified(anchors: Sequence[str]) -> str:
-    """Return the sentence on the anchors of which no range tells whether they stand elsewhere than told."""
+def unverified(anchors: Sequence[str], file: str) -> str:
+    """Return the sentence on the anchors of which no range tells whether they stand elsewhere than told.
+
+    `file` is the name of the file that tells more.
+    """
     named = listed(anchors, MOST_NAMED_ROBOTS, "more anchors")
     stand = "stand" if len(anchors) > 1 else "stands"
-    return f"no range tells whether {named} {stand} elsewhere than told; summary.json has the directions"
+    return f"no range tells whether {named} {stand} elsewhere than told; {file} has the directions"
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:

@@ -7,6 +7,7 @@ range counts at the nearest tick.
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -33,7 +34,14 @@ from compose.recording.ranging.range_recording import (
     RecordedRobot,
     locked,
 )
-from compose.recording.ranging.range_steps import NEARLY_ALL, Flags, RangeSteps, speeds, steps_of
+from compose.recording.ranging.range_steps import (
+    NEARLY_ALL,
+    UNMOVED,
+    Flags,
+    RangeSteps,
+    speeds,
+    steps_of,
+)
 from compose.recording.reasons import listed
 from protocol.noise import Noise
 
@@ -198,6 +206,7 @@ def measurements(
     """
     told = told_noise(noise) if isinstance(noise, str) else noise
     part = chosen_part(recording, robots, window)
+    outside = _without_odometry(recording, part) if window is None else 0
     assumed = told or stated_noise(part)
     if assumed.correction is not None:
         part = assumed.correction.corrected(part)
@@ -211,8 +220,18 @@ def measurements(
     with numerics(recording.source):
         found = _measurements(part, assumed, ticks, relative)
         if relative is None:
-            _check_anchors(part)
-        return msgspec.structs.replace(found, doubt=doubtful_units(part) if doubt is None else doubt)
+            _check_anchors(part, recording)
+        unused = Counter(found.unused)
+        unused[UNMOVED] += outside
+        doubt = doubtful_units(part) if doubt is None else doubt
+        return msgspec.structs.replace(found, doubt=doubt, unused=dict(+unused))
+
+
+def _without_odometry(recording: RangeRecording, part: RangeRecording) -> int:
+    """Return the number of ranges of the robots of `part` outside of the time of their odometry."""
+    t = recording.part([one.id for one in part.robots], -math.inf, math.inf).ranges.t
+    begin, end = part.span
+    return int(np.count_nonzero((t < begin) | (t > end)))
 
 
 def _measurements(
@@ -334,8 +353,12 @@ class NoAnchors(UserError):
     """One robot, or two, have no ranges to two anchors with positions at different places."""
 
 
-def _check_anchors(part: RangeRecording) -> None:
-    """Raise NoAnchors for one robot, or for two. Of more robots, some may be estimated."""
+def _check_anchors(part: RangeRecording, recording: RangeRecording) -> None:
+    """Raise NoAnchors for one robot, or for two, in `part`. Of more robots, some may be estimated."""
+    if (t := recording.ranges.t).size and not part.ranges.t.size:
+        begin, end = part.span
+        when = f"{t[0]:.15g} s to {t[-1]:.15g} s, and odometry of {begin:.15g} s to {end:.15g} s"
+        raise NoAnchors(f"{part.source}: ranges are of {when}: stamps have to be in s, on one clock")
     count, placed = len(part.robots), part.with_places()
     anchors = [placed.anchors_of(robot) for robot in range(count)]
     if count > 2 or len({(one.x, one.y) for own in anchors for one in own}) > 1:

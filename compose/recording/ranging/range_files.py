@@ -31,6 +31,7 @@ from compose.recording.ranging.recording_rows import (
     row_of,
 )
 from compose.recording.ranging.run_ranges import ranges_of_run
+from compose.recording.reasons import listed
 from compose.recording.recording_files import journals_in, user_errors
 from compose.recording.run import read
 from protocol import files
@@ -108,7 +109,9 @@ def _tables(folder: Path) -> Iterator[tuple[AnyRow, SourcePlace]]:
     tracks = {path: found for path in sorted(folder.iterdir()) if (found := TUM.fullmatch(path.name))}
     odometry = [name for name in ODOMETRY if (folder / f"{name}.csv").exists()]
     if not odometry and not any(found["table"] == "poses" for found in tracks.values()):
-        odometry = [ODOMETRY[0]]
+        raise BadRecording(
+            f"{folder}: it has no odometry: poses.csv, odometry.csv, or poses-ROBOT.tum of each robot"
+        )
     for name, kind in TABLES.items():
         path = folder / f"{name}.csv"
         if name in (*odometry, "ranges") or path.exists():
@@ -161,17 +164,26 @@ def _check_head(head: list[str], kind: type[Row], place: SourcePlace) -> None:
     """Raise BadRecording unless `head` has the columns of `kind`, each once, and all that are required."""
     head[:] = [name.strip() for name in head]
     known = kind.__struct_encode_fields__
+    required = known[: len(known) - len(kind.__struct_defaults__)]
+    unknown = [name for name in head if name not in known]
+    missing = [name for name in required if name not in head]
+    absent = f"the column {listed(missing)} is missing"
+    if len(missing) > 1:
+        absent = f"the columns {listed(missing)} are missing"
+    if unknown:
+        guess = did_you_mean(unknown[0], known)
+        if missing:
+            guess = f"; {absent}{guess}"
+        if kind is OdometryRow and unknown[0] in PoseRow.__struct_fields__:
+            guess = "; poses are in poses.csv"
+        if len(head) == 1 and any(one in unknown[0] for one in ";\t"):
+            guess = "; commas separate columns"
+        what = (
+            f"unknown column{'s' if len(unknown) > 1 else ''} {listed([f'{one[:40]!a}' for one in unknown])}"
+        )
+        raise BadRecording(f"{place}: {what}; there may be {', '.join(known)}{guess}")
     for name in head:
-        if name not in known:
-            guess = did_you_mean(name, known)
-            if kind is OdometryRow and name in PoseRow.__struct_fields__:
-                guess = "; poses are in poses.csv"
-            if len(head) == 1 and any(one in name for one in ";\t"):
-                guess = "; commas separate columns"
-            raise BadRecording(f"{place}: unknown column {name[:40]!a}; it has {', '.join(known)}{guess}")
         if head.count(name) > 1:
             raise BadRecording(f"{place}: there are two columns {name}")
-    required = known[: len(known) - len(kind.__struct_defaults__)]
-    missing = [name for name in required if name not in head]
     if missing:
-        raise BadRecording(f"{place}: the column {missing[0]} is missing")
+        raise BadRecording(f"{place}: {absent}")

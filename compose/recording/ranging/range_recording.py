@@ -190,6 +190,13 @@ class RangeRecording(NamedTuple):
         return RangeRecording(self.source, robots, anchors, moved.rows(kept))
 
 
+LONG_GAP_S = 10.0
+"""The time in s without odometry, or of one increment, from which on nothing is computed inside.
+
+A robot of 0.5 m/s may be 5 m away then, and ranges to it say little. With less, the short gaps of radios and
+drivers would be bridged in one step; with more, a single row costs more steps.
+"""
+
 LONGEST_GAP_S = 3600.0
 """The longest time in s without odometry that an estimate bridges.
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from compose.errors import BadRecording
 from compose.recording.ranging.range_recording import (
+    LONG_GAP_S,
     SAME_TIME_S,
     Numbers,
     Places,
@@ -23,6 +24,8 @@ from compose.recording.ranging.range_recording import (
 )
 
 Flags = NDArray[np.bool_]
+UNMOVED = "without odometry of all robots"
+"""The reason for which ranges are left out that are of other times than the odometry."""
 
 
 class RangeSteps(NamedTuple):
@@ -71,7 +74,7 @@ def steps_of(recording: RangeRecording, period_s: float = 1.0, spacing_s: float 
         locked((kept.t - t[step]) / (t[step + 1] - t[step])),
         {
             "within a second after another": len(known.t) - len(kept.t),
-            "without odometry of all robots": int(np.count_nonzero(~inside)),
+            UNMOVED: int(np.count_nonzero(~inside)),
             "in a gap of the odometry": int(np.count_nonzero(in_gap)),
         },
         locked(skipped_s),
@@ -120,14 +123,6 @@ def _common_times(recording: RangeRecording, period_s: float) -> tuple[Numbers, 
     times[-1] = min(times[-1], last)
     left: Numbers = np.multiply(period_s, number - np.arange(len(number)), dtype=np.float64)
     return times, left
-
-
-LONG_GAP_S = 10.0
-"""The time in s without odometry, or of one increment, from which on nothing is computed inside.
-
-A robot of 0.5 m/s may be 5 m away then, and ranges to it say little. With less, the short gaps of radios and
-drivers would be bridged in one step; with more, a single row costs more steps.
-"""
 
 
 def spaced(ranges: RangeSeries, spacing_s: float) -> Places:

@@ -16,6 +16,7 @@ from msgspec.structs import astuple
 
 from compose.errors import BadRecording
 from compose.recording.ranging.range_recording import (
+    LONG_GAP_S,
     LONGEST_GAP_S,
     SAME_TIME_S,
     FixedAnchor,
@@ -27,6 +28,7 @@ from compose.recording.ranging.range_recording import (
     TruePath,
     locked,
 )
+from compose.recording.reasons import listed
 from protocol.motion import Pose, heading_of, relative, wrap
 from protocol.spelling import did_you_mean
 from protocol.units import Angle, Coordinate, Range, RobotId, Sigma
@@ -167,8 +169,15 @@ TABLES: dict[str, type[AnyRow]] = {
 """The rows of each table, by its name."""
 Covariance6 = tuple[float, float, float, float, float, float]
 """The upper triangle of a covariance of (dx, dy, dheading), row by row."""
+HEADINGS = {
+    1.0: "in rad",
+    math.radians(1.0): "as degrees: are they in degrees",
+    -1.0: "clockwise: are they those of a compass, or are x and y exchanged",
+    -math.radians(1.0): "as degrees, clockwise: are they those of a compass",
+}
+"""The kinds of headings, by the factor that makes them rad counter-clockwise; the first is what is needed."""
 AGREEING = 0.9
-"""The part of the way from which on it is along the headings. Those of another unit have less than half."""
+"""The part of the way from which on it is along the headings. Those of another kind have less than half."""
 UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """The place in a Covariance6 of each element of the matrix."""
 
@@ -196,6 +205,8 @@ def wrong_field(error: msgspec.ValidationError, values: object = None) -> str:
     found = re.fullmatch(r"(?P<what>.*) - at `\$\.?(?P<field>.*)`", str(error), re.DOTALL)
     what, field = (found["what"], found["field"]) if found else (str(error), "")
     if isinstance(values, dict) and field in values:
+        if field in STAMPS and "=" in what:
+            what += " (a time in s)"
         expected = re.sub(r", got .*", "", what) + f", got {str(values[field])[:40]!a}"
         what = re.sub(r"`str` matching regex '[^']*'", "a name of letters, digits, - and _", expected)
     what = what.replace("Object ", "").replace("`float | null`", "a number").replace("`float`", "a number")
@@ -205,6 +216,8 @@ def wrong_field(error: msgspec.ValidationError, values: object = None) -> str:
 
 NAMES = frozenset(("robot", "anchor", "from", "to"))
 """The fields whose values are names; all others are numbers."""
+STAMPS = frozenset(("t", "t0", "t1"))
+"""The fields whose values are times."""
 
 
 class RecordingBuilder:
@@ -219,8 +232,8 @@ class RecordingBuilder:
         self._jumps: dict[str, list[Jump]] = {}
         self._truth: dict[str, list[TimedPose]] = {}
         self._poses: dict[str, TimedPose] = {}
-        self._courses: dict[str, tuple[float, complex, complex]] = {}
-        """The way (m) of each robot with poses, and its sums along the headings: in rad, as if in degrees."""
+        self._courses: dict[str, tuple[float, list[complex]]] = {}
+        """The way (m) of each robot with poses, and its sums along the headings as in each of HEADINGS."""
         self._given = {row.anchor: row for row in anchors}
         self._anchors: dict[str, AnchorRow] = {}
         self._antennas: dict[str, AntennaRow] = {}
@@ -296,19 +309,20 @@ class RecordingBuilder:
     def _add_course(self, robot: str, start: Pose, end: Pose) -> None:
         """Add a way to the sums. Its direction relative to the heading is doubled: a robot may back up."""
         way, sums = complex(end.x - start.x, end.y - start.y), []
-        for unit in (1.0, math.radians(1.0)):
+        for unit in HEADINGS:
             heading = unit * start.heading + wrap(unit * (end.heading - start.heading)) / 2.0
             along = way * cmath.exp(-1j * heading)
             sums.append(along**2 / abs(along) if along else 0j)
-        length, radians, degrees = self._courses.get(robot, (0.0, 0j, 0j))
-        self._courses[robot] = length + abs(way), radians + sums[0], degrees + sums[1]
+        length, before = self._courses.get(robot, (0.0, [0j] * len(HEADINGS)))
+        self._courses[robot] = length + abs(way), [one + more for one, more in zip(before, sums, strict=True)]
 
     def _check_headings(self) -> None:
-        """Raise BadRecording if the headings of a robot agree with its motion as degrees only."""
-        for robot, (length, radians, degrees) in self._courses.items():
-            if abs(degrees) > AGREEING * length > 2.0 * abs(radians):
-                what = f"the headings of {robot} agree with its motion only as degrees"
-                raise BadRecording(f"{self.source}: {what}: are they in degrees? They have to be in rad")
+        """Raise BadRecording if the headings of a robot agree with its motion only in others of HEADINGS."""
+        for robot, (length, sums) in self._courses.items():
+            for along, meaning in zip(sums, HEADINGS.values(), strict=True):
+                if abs(along) > AGREEING * length > 2.0 * abs(sums[0]):
+                    what = f"the headings of {robot} agree with its motion only {meaning}"
+                    raise BadRecording(f"{self.source}: {what}? They have to be in rad, counter-clockwise")
 
     def _add_jump(self, row: OdometryRow, before: float, place: object) -> None:
         """Note an increment that lasts, or begins after the time `before` by, more than LONGEST_GAP_S."""
@@ -361,7 +375,11 @@ class RecordingBuilder:
         return recording
 
     def _check_times(self, recording: RangeRecording) -> None:
-        """Raise BadRecording if all ranges of a pair, or all increments of a robot, are of one time."""
+        """Raise BadRecording if stamps are missing, or not in s.
+
+        Then, all ranges of a pair, or all increments of a robot, are of one time, or most increments are so
+        long that there is no estimate in them.
+        """
         paths = [(f"increments of {one.id}", one.odometry.t0, one.odometry.t1) for one in recording.robots]
         for pair, rows in recording.pairs().items():
             t = recording.ranges.t[rows]
@@ -370,6 +388,10 @@ class RecordingBuilder:
             if len(end) >= NOT_AT_ONCE and begin[-1] == end[0]:
                 all_of_them = f"all {len(end)} {what} are of {end[0]:.15g} s"
                 raise BadRecording(f"{self.source}: {all_of_them}: stamps are missing")
+            lasts = float(np.median(end - begin)) if len(end) >= NOT_AT_ONCE else 0.0
+            if lasts > LONG_GAP_S:
+                long = f"{what} last {lasts:.6g} s in the median, and {LONG_GAP_S:g} s is the limit"
+                raise BadRecording(f"{self.source}: {long}: are times in ms? They have to be in s")
 
     def _robot(self, name: str) -> RecordedRobot:
         rows, truth, antenna = self._odometry[name], self._truth.get(name), self._antennas.get(name)
@@ -390,7 +412,8 @@ class RecordingBuilder:
         what = "is neither a robot with odometry nor a known anchor"
         if len(names) == len(self._odometry):
             return f"{what}; the recording has no anchors"
-        return f"{what}{did_you_mean(name, names)}"
+        robots, anchors = listed(names[: len(self._odometry)]), listed(names[len(self._odometry) :])
+        return f"{what}; robots: {robots}; anchors: {anchors}{did_you_mean(name, names)}"
 
     def _range_series(self, names: Sequence[str]) -> RangeSeries:
         radios = {name: i for i, name in enumerate(names)}
