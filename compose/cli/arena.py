@@ -43,7 +43,7 @@ def main(options: argparse.Namespace) -> int:
     say(*arena.lines(rows))
     if not options.quiet:
         say("")
-        tell(arena.NOTE)
+        tell(*arena.reasons(results), arena.NOTE)
         if options.out is not None:
             say("", f"results: {options.out}")
     return max(map(status_of, results))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +17,7 @@ from compose.sweep.axis_figures import STYLES
 from compose.sweep.cells import Cell
 from compose.sweep.execution import Results
 from compose.sweep.spec import Sweep
-from compose.sweep.statistics import CellTrials, quantile, wilson
+from compose.sweep.statistics import WORSE, CellTrials, noted, quantile, wilson
 from compose.terminal import tables
 from protocol import files
 
@@ -127,6 +127,16 @@ def lines(rows: Sequence[Row]) -> list[str]:
     ]
     titles = ("localised", "wrong", *[name.replace("_", " ") for name in forms])
     return tables.shown(("scenario", "planner"), titles, cells)
+
+
+def reasons(results: Sequence[Results]) -> Iterator[str]:
+    """Yield why a mission of each planner did not localise, the worst first, as a line for the terminal."""
+    for one in results:
+        for cell in one.cells:
+            worst = noted(one.of(cell.index))
+            if worst is not None and worst.outcome in WORSE:
+                planner = one.sweep.axes[0].label(cell.place[0])
+                yield f"{one.sweep.source}, {planner}: trial {worst.trial}, {worst.outcome}: {worst.why}"
 
 
 def _with_interval(form: str, value: float | None, low: float | None, high: float | None) -> str:
