@@ -28,7 +28,16 @@ from agent.planning.assured import Assured
 from agent.planning.phase3_last_manoeuvre import compared
 from agent.planning.strides import stride
 from compose.cli.figures import draw
-from compose.figures import PICTURES, catalogue, encounter, manoeuvre, over_time, phase_one, trajectory
+from compose.figures import (
+    PICTURES,
+    catalogue,
+    encounter,
+    geometry,
+    manoeuvre,
+    over_time,
+    phase_one,
+    trajectory,
+)  # fmt: skip
 from compose.figures.agent_replay import agent_replay
 from compose.figures.pair import PairRecord, encounters, pair_of
 from compose.figures.sheet import Absent
@@ -380,6 +389,40 @@ def test_each_kind_of_figure_is_drawn_or_the_reason_is_printed(
     assert made >= always - missing
     assert any(name.startswith("plan-") for name in made) == ("plan-a-b" not in missing)
     assert sorted(out) == sorted(tmp_path.iterdir())
+
+
+def test_the_bands_of_figure_1_cover_both_paths_each_in_the_colour_of_its_phase(recordings: Path) -> None:
+    told = pair(recorded("paper-1", recordings))
+    figure = drawn(trajectory.draw(told, phases=True))
+    for role in ROLES:
+        side, ends = told.robot(role), []
+        for one in found(figure, f"band-{side.id}-.*"):
+            assert isinstance(one, Line2D)
+            first, phase = [int(word) for word in str(one.get_gid()).split("-")[2:]]
+            last = first + len(np.asarray(one.get_xdata())) - 1
+            assert one.get_color() == trajectory.PHASE_COLOURS[phase]
+            assert {side.phase(k) for k in range(first, last)} == {phase}
+            ends += [first, last]
+        assert [ends[0], *ends[1:-1:2], ends[-1]] == [0, *ends[2::2], len(side.path) - 1], "no gap"
+
+
+@pytest.mark.parametrize("name", ["paper-1", "assured"])
+def test_the_angles_of_figure_2_end_where_robots_come_into_range(name: str, recordings: Path) -> None:
+    told = pair(recorded(name, recordings))
+    figure, reach, (a, b) = drawn(geometry.draw(told)), told.mission.sensing_range, (told.a, told.b)
+    for one in found(figure, "eta"):
+        assert isinstance(one, Line2D)
+        (start, end) = np.transpose(np.asarray((one.get_xdata(), one.get_ydata()), float))
+        assert math.dist(start, end) == pytest.approx(told.mission.first_straight)
+        assert math.dist(end, (a.anchor.x, a.anchor.y)) == pytest.approx(reach)
+    assert len(found(figure, "eta")) == (2 if name == "paper-1" else 0)
+    reached = b.orbit.radius if name == "paper-1" else reach - b.orbit.radius
+    for one in found(figure, "omega"):
+        assert isinstance(one, Line2D)
+        (start, end) = np.transpose(np.asarray((one.get_xdata(), one.get_ydata()), float))
+        assert math.dist(start, end) == pytest.approx(a.orbit.radius)
+        assert math.dist(end, (b.anchor.x, b.anchor.y)) == pytest.approx(reached)
+    assert len(found(figure, "omega")) == 2
 
 
 def test_every_pair_has_figures_of_its_own(recordings: Path) -> None:

@@ -4,6 +4,17 @@
 figures by kind.
 """
 
-PICTURES = ("meetings", "trajectory", "phase-1", "plan", "encounter", "ranges", "errors", "robot")
+PICTURES = (
+    "meetings",
+    "trajectory",
+    "phases",
+    "geometry",
+    "phase-1",
+    "plan",
+    "encounter",
+    "ranges",
+    "errors",
+    "robot",
+)
 """The kinds of figures: that of a group, those of Figs. 3 and 4 of the paper, then those over time."""
 FIGURE_FORMATS = ("svg", "pdf", "png")

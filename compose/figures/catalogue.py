@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 from matplotlib.figure import Figure
 
 from compose.figures import (
     encounter,
+    geometry,
     manoeuvre,
     one_robot,
     over_time,
@@ -23,6 +24,13 @@ from compose.recording.group_localisation import past_meetings
 from compose.recording.run import Run
 
 Picture = tuple[str, Figure | Absent]
+OF_PAIR: dict[str, Callable[[PairRecord, Medium], Figure | Absent]] = {
+    "trajectory": trajectory.draw,
+    "geometry": geometry.draw,
+    "encounter": encounter.draw,
+    "ranges": over_time.ranges,
+}
+"""The figures of a pair that need no planner states."""
 
 
 def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[Picture]:
@@ -46,11 +54,10 @@ def pictures(pair: PairRecord, kind: str, medium: Medium = SCREEN) -> Iterator[P
         case "plan" if pair.readable:
             plans = manoeuvre.draw(pair, medium) if pair.planner is not None else {pair.name: foreign}
             yield from [(f"{kind}-{name}", figure) for name, figure in plans.items()]
-        case "trajectory" | "encounter" | "ranges":
-            one = {"trajectory": trajectory.draw, "encounter": encounter.draw, "ranges": over_time.ranges}[
-                kind
-            ]
-            yield f"{kind}-{pair.name}", one(pair, medium)
+        case "phases":
+            yield f"{kind}-{pair.name}", trajectory.draw(pair, medium, phases=True)
+        case kind if kind in OF_PAIR:
+            yield f"{kind}-{pair.name}", OF_PAIR[kind](pair, medium)
         case "errors" if pair.readable:
             yield f"{kind}-{pair.name}", over_time.errors(pair, medium)
 

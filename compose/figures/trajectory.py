@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from itertools import groupby
+from typing import Any
 
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -26,6 +27,7 @@ from compose.figures.sheet import (
 )
 from compose.figures.style import INK, PALE, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS, line_style
+from compose.view.events import PHASE_NAMES
 from protocol.mission import ROLES, Role
 
 TALLEST_PLANE = 4.6
@@ -34,24 +36,37 @@ INSET, LEAST_ZOOM = 0.3, 1.6
 """The side of the inset as a fraction of the smaller one of the plane, and the least factor of its scale."""
 MANY = 160
 """The maximum number of markers on a path."""
+BAND = 7.0
+"""The width of a band along a path, in points."""
+PHASE_COLOURS = {1: "#bfe3b4", 2: "#bfe1f4", 3: "#f6d9a8"}
+"""The colours of the bands of each phase: green and light blue as in the paper, and orange."""
 RANGE_ARROW = 0.35
 """The length of a heading arrow, as a fraction of the sensing range."""
 
 
-def draw(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent:
-    """Return the figure: the plane with the key below it."""
+def draw(pair: PairRecord, medium: Medium = SCREEN, phases: bool = False) -> Figure | Absent:
+    """Return the figure: the plane with the key below it; with `phases`, in their colours, as in Fig. 1."""
     if not pair.placed:
         return Absent(NO_PLACES)
     sheet = Sheet(medium, True, [pair.title])
-    draw_plane(sheet.panels["plane"], pair)
+    draw_plane(sheet.panels["plane"], pair, phases=phases)
     sheet.plane("plane", window(pair), TALLEST_PLANE)
     sheet.key(sheet.panels["plane"])
     figure = sheet.finished()
-    _inset(sheet.panels["plane"], pair)
+    _inset(sheet.panels["plane"], pair, phases)
     return figure
 
 
-def _inset(axes: Axes, pair: PairRecord) -> None:
+def _bands(axes: Axes, pair: PairRecord) -> None:
+    """Draw both paths as bands in the colours of their phases."""
+    for role in ROLES:
+        one = pair.robot(role)
+        draw_trail(axes, one, role, range(one.first, len(one.path)), lw=BAND, band=True)
+    for phase, colour in PHASE_COLOURS.items():
+        entry(axes, f"phase {phase}: {PHASE_NAMES[phase]}", "-", lw=BAND, color=colour, solid_capstyle="butt")
+
+
+def _inset(axes: Axes, pair: PairRecord, phases: bool) -> None:
     """Draw the encounter larger in a corner without paths if it fills a small part of the plane only."""
     if pair.encounter_tick is None:
         return
@@ -68,7 +83,7 @@ def _inset(axes: Axes, pair: PairRecord) -> None:
         key=lambda at: sum([at[0] < one.x < at[0] + side and at[1] < one.y < at[1] + side for one in paths]),
     )
     inset = axes.inset_axes((x, y, side, side), transform=axes.transData, zorder=7)
-    draw_plane(inset, pair)
+    draw_plane(inset, pair, phases=phases)
     for drawn in inset.findobj():
         drawn.set_gid(None)  # it is drawn a second time
     for text in inset.texts:
@@ -77,16 +92,20 @@ def _inset(axes: Axes, pair: PairRecord) -> None:
     axes.indicate_inset_zoom(inset, edgecolor=PALE, lw=0.6)
 
 
-def draw_plane(axes: Axes, pair: PairRecord, about: Role | None = None) -> None:
-    """Draw the mission from above, with the last positions; `about` one robot, its peer is pale instead."""
+def draw_plane(axes: Axes, pair: PairRecord, about: Role | None = None, phases: bool = False) -> None:
+    """Draw the mission from above, with the last positions; `about` one robot, its peer is pale instead.
+
+    With `phases`, bands have the colours of the phases.
+    """
+    if phases:
+        _bands(axes, pair)
     for role in ROLES:
-        _anchor(axes, pair, role)
+        anchor(axes, pair, role)
     for role in ROLES:
         _path(axes, pair, role, alpha=1.0 if about in (None, role) else 0.4)
     entry(axes, "start", "s", ms=6, mfc="white", mec=INK, mew=1.2)
-    for phase in sorted(
-        {phase for role in ROLES for phase in pair.robot(role).phases[pair.robot(role).first :]}
-    ):
+    driven = {phase for role in ROLES for phase in pair.robot(role).phases[pair.robot(role).first :]}
+    for phase in [] if phases else sorted(driven):
         entry(axes, f"path in phase {phase}", ls=line_style(phase), lw=1.2, color=PALE)
     met, contact = pair.encounter_tick, next((first for first, _ in pair.contacts), None)
     moments = {"contact": (contact, "first contact", ":"), "met": (met, "encounter", (0, (1, 1)))}
@@ -113,8 +132,8 @@ def window(pair: PairRecord) -> Window:
     return around(points, 0.03)
 
 
-def _anchor(axes: Axes, pair: PairRecord, role: Role) -> None:
-    """Draw the anchor of the robot with `role`, its sensing range, and its orbit if it drives there."""
+def anchor(axes: Axes, pair: PairRecord, role: Role, orbit: bool = True) -> None:
+    """Draw the anchor of the robot with `role`, its sensing range, and its `orbit` if it drives there."""
     one, reach, first = pair.robot(role), pair.mission.sensing_range, role == "a"
     place, label = (one.anchor.x, one.anchor.y), "anchors $M_1$, $M_2$" if first else None
     axes.plot(*place, "x", color="k", ms=6, mew=1.4, gid=f"anchor-{one.id}", zorder=4, label=label)
@@ -122,7 +141,7 @@ def _anchor(axes: Axes, pair: PairRecord, role: Role) -> None:
     axes.annotate(name, place, xytext=(5, 5), textcoords="offset points", zorder=6, bbox=LABEL)
     label = f"sensing range, {reach:g} m" if first else None
     circle(axes, place, reach, ls=(0, (4, 3)), lw=0.8, color="k", gid=f"range-{one.id}", label=label)
-    if one.on_orbit:
+    if orbit and one.on_orbit:
         label = f"orbit of {one.id}, {one.orbit.radius:.4g} m"
         look = {"lw": 0.6, "color": COLOURS[role], "alpha": 0.5, "gid": f"orbit-{one.id}", "label": label}
         circle(axes, place, one.orbit.radius, **look)
@@ -145,12 +164,19 @@ def _path(axes: Axes, pair: PairRecord, role: Role, alpha: float) -> None:
 
 
 def draw_trail(
-    axes: Axes, one: Side, role: Role, ticks: Sequence[int], lw: float = 1.2, alpha: float = 1.0
+    axes: Axes,
+    one: Side,
+    role: Role,
+    ticks: Sequence[int],
+    lw: float = 1.2,
+    alpha: float = 1.0,
+    band: bool = False,
 ) -> None:
-    """Join the positions in successive `ticks` by lines, one line style per phase."""
+    """Join the positions in successive `ticks` by lines, one style per phase; a `band` has its colour."""
     for phase, group in groupby(ticks[:-1], key=one.phase):
         piece = list(group)
-        trace(
-            axes, one.path[piece[0] : piece[-1] + 2], ls=line_style(phase), lw=lw, color=COLOURS[role],
-            alpha=alpha, zorder=2.5, gid=f"trail-{one.id}-{piece[0]}-{phase}",
-        )  # fmt: skip
+        look: dict[str, Any] = {"ls": line_style(phase), "color": COLOURS[role], "zorder": 2.5}
+        if band:
+            look = {"ls": "-", "color": PHASE_COLOURS[phase], "zorder": 1.5, "solid_capstyle": "butt"}
+        gid = f"{'band' if band else 'trail'}-{one.id}-{piece[0]}-{phase}"
+        trace(axes, one.path[piece[0] : piece[-1] + 2], lw=lw, alpha=alpha, gid=gid, **look)
