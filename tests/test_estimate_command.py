@@ -8,25 +8,29 @@ import math
 import re
 from pathlib import Path
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
+from agent.estimation.following import ClaimRule
 from compose.cli import estimate as estimate_command
 from compose.cli.commands import COMMANDS
 from compose.cli.main import command_parser
 from compose.errors import NOT_LOCALISED, USER_ERROR, CannotWrite, UserError
 from compose.recording.estimating import estimate_run
 from compose.recording.estimating.estimate_rows import PoseEstimateRow
-from compose.recording.estimating.estimate_run import RecordingEstimate
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import EPOCH_S, measurements
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (
     RangeRecording,
 )
-from compose.view.epochs import write_player
+from compose.view.epochs import played, write_player
 from compose.view.played_estimate import PLAYER_JSON, read_player
 from compose.view.recorded import scenes as recorded_scenes
-from protocol.motion import travelled
+from protocol.messages import Estimate, Observation
+from protocol.motion import compose, inverse, travelled
 from tandem import estimate
 from tests.commands import tandem
 from tests.range_tables import SAMPLE, circling, written_csv
@@ -89,6 +93,45 @@ def test_the_page_plays_an_estimate_as_a_run_in_which_claims_and_hypotheses_are_
         with pytest.raises(UserError) as bad:
             read_player(tmp_path)
         assert str(bad.value) == f"{file} cannot be read: {says}"
+
+
+def test_after_a_long_gap_the_page_has_ranges_and_odometry_of_their_times(sample: RangeRecording) -> None:
+    gap_s, after_s = 20.0, 20.0
+    begin = sample.span[0]
+
+    def later(t: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.where(t >= begin + after_s, gap_s, 0.0)
+
+    robots = []
+    for robot in sample.robots:
+        path, late = robot.odometry, later(robot.odometry.t0)
+        robots.append(robot._replace(odometry=path._replace(t0=path.t0 + late, t1=path.t1 + late)))
+    moved = sample.ranges._replace(t=sample.ranges.t + later(sample.ranges.t))
+    gapped = sample._replace(robots=tuple(robots), ranges=moved)
+    problem = measurements(gapped, ("A", "B"), "uwb-calibrated", None)
+    player = played(problem, estimated(problem, ClaimRule(0.3, 0.9999)))
+    after = [one for one in player.epochs if one.tick * EPOCH_S > after_s + gap_s + 1.0]
+    observed = [one for epoch in after for one in epoch.messages if isinstance(one, Observation)]
+    assert len(after) > 10
+    assert all(one.executed is not None for one in observed)
+    assert sum([len(one.anchors) for one in observed]) > 10
+
+
+def test_the_page_has_the_way_to_each_pose_by_odometry(
+    sample: RangeRecording, of_sample: RecordingEstimate
+) -> None:
+    player = played(measurements(sample, ("A", "B"), "uwb-calibrated", None), of_sample)
+    for robot in "AB":
+        estimates = [
+            (epoch.truth[robot], one)
+            for epoch in player.epochs
+            for one in epoch.messages
+            if isinstance(one, Estimate) and one.robot == robot and one.world
+        ]
+        last = estimates[-1][1]
+        turn = compose(last.world[0], inverse(last.local[0]))
+        assert max(travelled(compose(turn, one.local[0]), truth) for truth, one in estimates) < 0.5
+        assert travelled(estimates[0][0], estimates[-1][0]) > 2.0
 
 
 def test_the_command_writes_a_table_a_summary_and_figures(tmp_path: Path) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from compose.errors import NoSuchField
+from compose.figures.style import SWEEP_MEDIUM, look
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from compose.sweep import axis_figures, execution, spec
@@ -131,3 +132,23 @@ def test_labels_that_are_numbers_make_a_curve(labels: str, curve: bool, tmp_path
     for one in found:
         in_order = [one.ticks_p10, one.ticks_p50, one.ticks_p90, one.ticks_p95, one.ticks_max]
         assert in_order == sorted(in_order, key=lambda ticks: ticks or 0.0)
+
+
+def test_no_label_of_a_legend_leaves_the_figure(tmp_path: Path) -> None:
+    sweep = spec.load(str(written(tmp_path, "mission.noise.anchor_sigma", [0.03, 0.05, 0.1, 0.25])))
+    names = [f"anchor_sigma = {one}" for one in (0.03, 0.05, 0.1, 0.25)]
+    points = [axis_figures.FigurePoint(name, value, "", 0.5, 0.4, 0.6) for name in names for value in (0, 1)]
+    with look(SWEEP_MEDIUM):
+        figure = axis_figures.over_axis(sweep, 1, axis_figures.STATISTICS["success"], points)
+        figure.draw_without_rendering()
+        extents = [text.get_window_extent() for text in figure.legends[0].texts]
+    assert len(extents) == len(names)
+    assert all(figure.bbox.x0 <= one.x0 < one.x1 <= figure.bbox.x1 for one in extents)
+
+
+def written(folder: Path, field: str, values: list[float]) -> Path:
+    """Return the path of a sweep over `values` of a field, and over two planners."""
+    axes = f'[[axis]]\nfield = "{field}"\nvalues = {values}\n[[axis]]\nfield = "planner.name"\n'
+    path = folder / "two.toml"
+    path.write_text(f'name = "two"\nscenario = "noisy"\ntrials = 1\n{axes}values = ["assured", "paper"]\n')
+    return path

@@ -336,7 +336,7 @@ def test_an_estimate_shows_its_robots_and_its_figures(opened: Open, tmp_path: Pa
     with watching(folder) as (_, where):
         page = opened(where)
         expect(page.locator("#title")).to_have_text("tiers-a-b-30-s.pyfg")
-        expect(page.locator("#status")).to_contain_text("after 23 ticks")
+        expect(page.locator("#status")).to_contain_text("undecided at the end")
         scrub_to(page, 12)
         expect(page.locator("#robots")).to_contain_text("hypotheses")
         page.get_by_role("link", name="Table and figures").click()

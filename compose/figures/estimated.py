@@ -157,7 +157,7 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
         if math.isfinite(at[0]):
             axes.plot(*at, ls="", marker=marker, ms=5, color=INK, label=f"anchor {anchor.id}")
             points.append(at)
-    entry(axes, "3 sigma", color=PALE, lw=6.0, alpha=0.3)
+    entry(axes, "3 sigma", color=PALE, lw=6.0, alpha=0.3, solid_capstyle="butt")
     sheet.plane("plane", around(points, PATH_MARGIN), TALLEST)
     sheet.key(axes)
     return sheet.finished()

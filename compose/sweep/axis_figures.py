@@ -34,8 +34,8 @@ LOGARITHMIC = 20.0
 """The ratio of the largest to the smallest value from which on an axis is logarithmic."""
 FITTING = 60
 """The total length in characters up to which the labels below an axis are horizontal."""
-WIDEST_LEGEND = 96
-"""The length in characters of the widest row of a legend."""
+WIDEST_LEGEND, BESIDE_LABEL = 104, 9
+"""The length in characters of the widest row of a legend, and of the marker beside each label."""
 _AXIS_NUMBER = re.compile(r"[0-9]+(?:\.[0-9]+)?").fullmatch
 POINTS_SPREAD = 0.45
 """The fraction of the space of a label over which the points of several lines are spread."""
@@ -159,7 +159,7 @@ def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[F
     if labels:
         others = [one for one in sweep.axes if one is not axis and len(one.values) > 1]
         unpaired = ", ".join([one.name for one in others if not one.paired])
-        columns = next((n for n in (4, 2) if n * max(map(len, labels)) < WIDEST_LEGEND), 1)
+        columns = next((n for n in (4, 2) if n * (BESIDE_LABEL + max(map(len, labels))) <= WIDEST_LEGEND), 1)
         figure.legend(
             handles,
             labels,

@@ -531,7 +531,7 @@ def _ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
             are, each = ("is", "it") if robots == 1 else ("are", "each")
             text = f"{who} {are} localised: {each} knows its position and its heading."
         case "undecided":
-            text = f"The mission ends undecided{why}"
+            text = f"The {'recording' if setup.mode == ESTIMATED else 'mission'} ends undecided{why}"
             truth = " ".join(filter(None, [_silent_links(setup), truth])) or None
         case "inconsistent":
             verdicts = [now.commands[robot].verdict for robot in setup.ids if robot in now.commands]

@@ -15,6 +15,7 @@ from compose.recording.estimating.estimate_rows import FinalHypothesis, PoseEsti
 from compose.recording.estimating.estimate_run import RecordingEstimate
 from compose.recording.estimating.recorded_measurements import EPOCH_S, Measurements
 from compose.recording.estimating.true_poses import true_pose
+from compose.recording.ranging.range_recording import SAME_TIME_S, RecordedRobot
 from compose.recording.run_setup import ESTIMATED, AnchorSetup, RobotSetup, RunSetup
 from compose.view.played_estimate import PLAYER_JSON, Epoch, PlayedEstimate
 from protocol import files
@@ -29,7 +30,7 @@ from protocol.messages import (
     Observation,
 )
 from protocol.mission import Anchor, Mission
-from protocol.motion import Controls, Covariance, Pose
+from protocol.motion import Controls, Covariance, Pose, compose
 from protocol.noise import Noise
 
 
@@ -39,14 +40,15 @@ def played(problem: Measurements, estimate: RecordingEstimate) -> PlayedEstimate
     order = ranges.tick.argsort(kind="stable")
     of_epoch = -(ranges.tick[order] // -problem.ticks_per_epoch)  # rounded up
 
-    def measured(tick: int) -> Places:
-        """Return the rows of the ranges that end in the epoch `tick`."""
-        return np.sort(order[slice(*np.searchsorted(of_epoch, (tick, tick + 1)))])
+    def measured(number: int) -> Places:
+        """Return the rows of the ranges that end in the epoch `number`."""
+        return np.sort(order[slice(*np.searchsorted(of_epoch, (number, number + 1)))])
 
-    epochs = [_epoch(problem, 0, problem.t0, measured(0), (), ())]
+    epochs = [_epoch(problem, 0, 0, problem.t0, measured(0), (), ())]
     for one in estimate.epochs:
         tick = max(round((one.t - problem.t0) / EPOCH_S), epochs[-1].tick + 1)
-        epochs.append(_epoch(problem, tick, one.t, measured(tick), one.rows, one.hypotheses))
+        number = int(np.searchsorted(problem.ends, one.t - SAME_TIME_S)) + 1
+        epochs.append(_epoch(problem, tick, number, one.t, measured(number), one.rows, one.hypotheses))
     last, why = epochs[-1].tick, estimate.summary.blocking_reason
     sigma, longest = (float(np.max(one, initial=1e-3)) for one in (ranges.sigma, ranges.rho))
     localised = bool(estimate.epochs) and all(estimate.epochs[-1].claims)
@@ -72,6 +74,7 @@ def played(problem: Measurements, estimate: RecordingEstimate) -> PlayedEstimate
 def _epoch(
     problem: Measurements,
     tick: int,
+    number: int,
     t: float,
     measured: Places,
     rows: Sequence[PoseEstimateRow],
@@ -79,7 +82,7 @@ def _epoch(
 ) -> Epoch:
     """Return an epoch that ends at `t` s: what each robot has measured in it, and holds at its end.
 
-    `measured` are the rows of its ranges.
+    `number` counts the epochs without those that long gaps leave out; `measured` are the rows of its ranges.
     """
     ids, held = [one.id for one in problem.robots], {row.robot: row for row in rows}
     epoch = Epoch(tick, {}, [])
@@ -95,6 +98,7 @@ def _epoch(
                 anchors[robot][other] = NamedRange(other, float(ranges.rho[i]))
     for one in problem.robots:
         robot, row = one.id, held.get(one.id)
+        way = (_dead_reckoned(problem, one.recorded, number),)
         ranged = (*contacts[robot].values(),), (), (*anchors[robot].values(),)
         poses = tuple([Pose(*each.poses[robot]) for each in hypotheses] if row is not None else [])
         covariance, verdict, state = None, None, "unlocated"
@@ -106,9 +110,9 @@ def _epoch(
         shares = tuple([min(each.probability / total, 1.0) for each in hypotheses] if poses else [])
         epoch.messages.extend(
             [
-                Observation(tick, robot, _driven(problem, robot, tick), None, *ranged),
+                Observation(tick, robot, _driven(problem, robot, number), None, *ranged),
                 Command(tick, robot, 0.0, 0.0, 3 if poses else 1, state, verdict),
-                Estimate(tick, robot, (), poses, verdict is not None, shares, covariance),
+                Estimate(tick, robot, way if poses else (), poses, verdict is not None, shares, covariance),
             ]
         )
         if (true := true_pose(one.recorded, t)) is not None:
@@ -116,10 +120,19 @@ def _epoch(
     return epoch
 
 
-def _driven(problem: Measurements, robot: str, tick: int) -> Controls | None:
-    """Return the speed and the turn rate over the epoch before `tick`, by the odometry; None at tick 0."""
+def _dead_reckoned(problem: Measurements, robot: RecordedRobot, number: int) -> Pose:
+    """Return the pose of the robot's centre at the end of the epoch `number`, by odometry alone."""
+    path, (forward, left, _) = problem.path(robot.id), robot.antenna
+    k = min(number * problem.ticks_per_epoch, len(path.heading) - 1)
+    return compose(
+        Pose(float(path.x[k]), float(path.y[k]), float(path.heading[k])), Pose(-forward, -left, 0.0)
+    )
+
+
+def _driven(problem: Measurements, robot: str, number: int) -> Controls | None:
+    """Return the speed and the turn rate over the epoch `number`, by the odometry; None of epoch 0."""
     path, per = problem.path(robot), problem.ticks_per_epoch
-    before, now = (tick - 1) * per, min(tick * per, len(path.heading) - 1)
+    before, now = (number - 1) * per, min(number * per, len(path.heading) - 1)
     if not 0 <= before < now:
         return None
     distance = float(np.sum(path.v[before:now])) * problem.joint.period

@@ -69,7 +69,8 @@ def events(
     if end is not None and end.tick == now.tick:
         plain = plain_reason(end)
         why = f" ({plain})" if plain else ""
-        yield Event(now.tick, "end", None, f"The mission ends: {end.outcome}{why}")
+        what = "recording" if setup.mode == ESTIMATED else "mission"
+        yield Event(now.tick, "end", None, f"The {what} ends: {end.outcome}{why}")
 
 
 def _presence(robot: str | None, before: TickData | None, now: TickData) -> Iterator[Event]:

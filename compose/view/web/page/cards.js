@@ -182,12 +182,13 @@ function attacked(store, tick, { id, peer }, { gap }) {
   return `${id} ${off}. ${peer} ${kind === "undecided" ? "ends undecided" : `rejects ${id}`} ${at}: ${reason}.`;
 }
 
-function measured(player, robot, { team, anchors }) {
+function measured(player, robot, { team, anchors, mode }) {
   if (!player.sensed) return "unknown";
   const odometry = player.executed ? `odometry ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
   const none = robot.anchor ? "no range to its anchor" : anchors.length ? "no range to an anchor" : "no anchor";
   const anchor = player.anchors?.length ? player.anchors.map(([id, range]) => `${id} ${metres(range)}`).join(", ") : player.anchor_range === undefined ? none : `anchor ${metres(player.anchor_range)}`;
-  if (!player.contacts?.length) return `${odometry}${anchor}; ${team ? "no robot is in range" : `${robot.peer} is not in range`}`;
+  const alone = mode === "estimate" ? "no range to a robot" : team ? "no robot is in range" : `${robot.peer} is not in range`;
+  if (!player.contacts?.length) return `${odometry}${anchor}; ${alone}`;
   const contacts = player.contacts.map(([peer, range]) => `${peer} ${range === null ? "in range, not measured" : metres(range)}`);
   return `${odometry}${anchor}; ${contacts.join(", ")}`;
 }

@@ -25,7 +25,7 @@ export async function estimate(root) {
 const COLUMNS = ["robot", "anchors", "first claim, s", "x", "y", "heading", "sigma, m", "error, m", "NEES"];
 
 function table(robots, begin_s) {
-  const head = make("tr", {}, ...COLUMNS.map((title) => make("th", { scope: "col", textContent: title })));
+  const head = make("tr", {}, ...COLUMNS.map((title, i) => make("th", { scope: "col", className: i > 1 ? "figure" : "", textContent: title })));
   const body = Object.entries(robots).map(([name, robot]) => make("tr", {},
     make("th", { scope: "row", textContent: name }),
     make("td", { textContent: robot.anchors.join(", ") }),

@@ -75,7 +75,7 @@ function cell(row, axes, caption, on_cell) {
   return button;
 }
 
-const title = (axis) => axis.name.split(".").at(-1);
+const title = (axis) => axis.name.replace(/\.name$/, "").split(".").at(-1);
 const labels = (axis) => axis.labels ?? axis.values.map((value) => [value].flat().map((one) => one ?? "–").join(", "));
 
 /** Returns all combinations of places on `axes`; one without places if there are no axes. */

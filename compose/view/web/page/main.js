@@ -340,7 +340,7 @@ function legend_names() {
 
 function controls() {
   const lost = document.body.classList.contains("lost");
-  text($("status"), lost ? "connection to the server lost" : state_of(store.live, store.last, store.end));
+  text($("status"), lost ? "connection to the server lost" : store.estimated && store.end ? `${store.end.outcome} at the end` : state_of(store.live, store.last, store.end));
   const outcome = lost ? "lost" : store.end?.outcome ?? (store.live ? "live" : "torn");
   attribute($("status"), "data-outcome", outcome);
   attribute($("status"), "title", store.end?.reason ?? "");

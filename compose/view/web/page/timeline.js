@@ -65,7 +65,7 @@ export class Timeline {
         lengthen(spans, this.read, player.down ? -phase : phase, store.grouped ? store.role(this.read, player.robot) : null);
         const count = player.held?.world.length || player.held?.local.length;
         if (count > 1) lengthen(this.counts.get(player.robot), this.read, count);
-        if (player.contacts?.length) lengthen(this.contacts.get(player.robot), this.read, 1);
+        if (player.contacts?.length && !store.estimated) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
       for (const event of scene.events) {
         if (event.kind in MARKED) this.marks.push([this.read, event.kind, event.robot]);
