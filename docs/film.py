@@ -17,6 +17,7 @@ from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 from PIL import Image
 from playwright.sync_api import Page, sync_playwright
 
@@ -32,6 +33,11 @@ STILL_AFTER = 6
 """The number of frames with a mark before the one that is a picture of it."""
 MOVED = 0.025
 """The share of changed pixels from which on the camera moves. Of its movement, the last frame is shown."""
+FAINT, STRONG, STRONGLY = 0.008, 0.002, 90
+"""The share of changed pixels from which on something fades, or the camera comes to rest.
+
+Less than the share STRONG then changes by more than STRONGLY, of 255. Of these, too, the last is shown.
+"""
 LAST_MS = 3000
 """The time in ms for which the last frame is shown."""
 MOST_MS = 300_000
@@ -97,30 +103,32 @@ def _opened(html: str, size: tuple[int, int]) -> Iterator[Page]:
         shown.close()
 
 
-def _played(page: Page) -> Iterator[bytes]:
-    """Play the page, and yield a PNG file for each FRAME_MS."""
+def _played(page: Page) -> Iterator[tuple[bytes, str]]:
+    """Play the page, and yield a PNG file and the caption in it for each FRAME_MS."""
     page.locator("#play").evaluate("(button) => button.click()")
     for _ in range(MOST_MS // FRAME_MS):
         page.clock.fast_forward(FRAME_MS)
-        yield page.screenshot()
+        yield page.screenshot(), page.locator("#caption").inner_text()
         if page.locator("#play").get_attribute("aria-label") == "Play":
             return
 
 
-def _gif(frames: list[bytes]) -> bytes:
-    """Return PNG files as an animated GIF; equal frames in a row become one."""
+def _gif(frames: list[tuple[bytes, str]]) -> bytes:
+    """Return PNG files with captions as an animated GIF; equal frames in a row become one."""
     images: list[Image.Image] = []
     durations: list[int] = []
+    captions: list[str] = []
     before = b""
-    for frame in frames:
+    for frame, caption in frames:
         if frame == before:
             durations[-1] += FRAME_MS
             continue
         before = frame
         images.append(Image.open(BytesIO(frame)).convert("RGB"))
         durations.append(FRAME_MS)
+        captions.append(caption)
     durations[-1] = LAST_MS
-    images, durations = _cut(images, durations)
+    images, durations = _cut(images, durations, captions)
     palette = Image.new("P", (1, 1))
     palette.putpalette(_colours())
     shown = [np.asarray(image.quantize(palette=palette, dither=Image.Dither.NONE)) for image in images]
@@ -131,28 +139,38 @@ def _gif(frames: list[bytes]) -> bytes:
     file = BytesIO()
     first.save(
         file, "GIF", save_all=True, append_images=rest, duration=durations, loop=0,
-        transparency=SAME_PIXEL, disposal=1, optimize=False,
+        palette=bytes(_colours()), transparency=SAME_PIXEL, disposal=1, optimize=False,
     )  # fmt: skip
     return file.getvalue()
 
 
-def _cut(images: list[Image.Image], durations: list[int]) -> tuple[list[Image.Image], list[int]]:
-    """Return the frames and their durations without those in which the camera is on its way.
+def _cut(
+    images: list[Image.Image], durations: list[int], captions: list[str]
+) -> tuple[list[Image.Image], list[int]]:
+    """Return the frames and their durations without those in which the camera moves, or something fades.
 
-    Each of these would be as large as ten others.
+    Each of the former would be as large as ten others, each of the latter as three. Their time is that of the
+    next frame if it has the same caption, else of the frame before.
     """
-    pixels = [np.asarray(image) for image in images]
-    moved = [bool((now != was).any(axis=2).mean() > MOVED) for was, now in pairwise(pixels)]
-    kept, lasting = [images[0]], [durations[0]]
-    for image, duration, moves, goes_on in zip(
-        images[1:], durations[1:], moved, [*moved[1:], False], strict=True
-    ):
-        if moves and goes_on:
-            lasting[-1] += duration
-        else:
-            kept.append(image)
-            lasting.append(duration)
-    return kept, lasting
+    pixels = [np.asarray(image).astype(int) for image in images]
+    moved = [_passing(np.abs(now - was).max(axis=2)) for was, now in pairwise(pixels)]
+    kept: list[int] = []
+    lasting: list[int] = []
+    for i, goes_on in enumerate([*moved, False]):
+        if i > 0 and moved[i - 1] and goes_on and durations[i] == FRAME_MS:
+            continue
+        left_out = range(kept[-1] + 1 if kept else 0, i)
+        lasting.append(durations[i] + FRAME_MS * sum([captions[one] == captions[i] for one in left_out]))
+        if kept:
+            lasting[-2] += FRAME_MS * sum([captions[one] != captions[i] for one in left_out])
+        kept.append(i)
+    return [images[i] for i in kept], lasting
+
+
+def _passing(change: NDArray[np.int_]) -> bool:
+    """Return whether the camera moves or something fades in a frame, whose pixels differ by `change`."""
+    share = float((change > 0).mean())
+    return share > MOVED or (share > FAINT and float((change > STRONGLY).mean()) < STRONG)
 
 
 def _colours() -> list[int]:

@@ -27,7 +27,7 @@ def test_no_figure_of_a_sweep_or_an_estimate_is_stale() -> None:
 
 def test_the_animation_of_the_readme_is_small_and_lasts_as_long_as_guided_play() -> None:
     path = ROOT / "docs" / "page.gif"
-    assert path.stat().st_size < 1_000_000
+    assert path.stat().st_size < 700_000
     with Image.open(path) as animation:
         assert animation.size == (film.WIDTH, film.HEIGHT)
         durations = [frame.info["duration"] for frame in ImageSequence.Iterator(animation)]
