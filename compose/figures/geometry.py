@@ -22,7 +22,7 @@ from compose.figures.sheet import (
     trace,
 )
 from compose.figures.style import INK, PALE, SCREEN, Medium
-from compose.figures.trajectory import RANGE_ARROW, TALLEST_PLANE, anchor, draw_trail
+from compose.figures.trajectory import RANGE_ARROW, TALLEST_PLANE, anchor, draw_trail, window
 from compose.view.colours import COLOURS
 from protocol.mission import ROLES, Role
 from protocol.motion import TAU, Pose
@@ -55,11 +55,12 @@ def _circled(pair: PairRecord, role: Role) -> tuple[Role, int, range] | None:
         one.task if one is not None and one.phase == 1 else ""
         for one in pair.robot(role).commands[: pair.placed]
     ]
-    if "circling" not in tasks or "straight" not in tasks:
+    first = tasks.index("circling") if "circling" in tasks else 0
+    starts = [k for k in range(first) if tasks[k] == "straight" and tasks[k - 1 : k] != ["straight"]]
+    if not starts:
         return None
-    first = tasks.index("circling")
     last = next((k for k in range(first, len(tasks)) if tasks[k] != "circling"), len(tasks) - 1)
-    return role, max(k for k in range(first) if tasks[k] == "straight"), range(first, last + 1)
+    return role, starts[-1], range(first, last + 1)
 
 
 def _circle(sheet: Sheet, pair: PairRecord, role: Role, tick: int, ticks: range) -> None:
@@ -127,14 +128,7 @@ def _orbits(sheet: Sheet, pair: PairRecord) -> None:
     trace(axes, ends, ":", lw=1.3, color=INK, label=f"{between:.4g} m between the robots", zorder=3)
     letter = "(b) " if "circle" in sheet.panels else ""
     axes.set_title(rf"{letter}phase 2: $D$ = {apart:.4g} m, $\Omega$ = {half:.3f} rad", loc="left", pad=3)
-    points = [
-        (one.anchor.x + dx, one.anchor.y + dy)
-        for one in (a, b)
-        for reach in [max(one.orbit.radius, pair.mission.sensing_range)]
-        for dx in (-reach, reach)
-        for dy in (-reach, reach)
-    ]
-    sheet.plane("orbits", around(points, 0.03), TALLEST_PLANE, low="circle" not in sheet.panels)
+    sheet.plane("orbits", window(pair), TALLEST_PLANE, low="circle" not in sheet.panels)
 
 
 def _angle(axes: Axes, at: Pose, radius: float, between: tuple[float, float], name: str) -> None:
