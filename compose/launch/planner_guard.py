@@ -21,13 +21,14 @@ ANSWERS = {"command": Command, "estimate": Estimate, "summary": Summary, "rendez
 """The types of the answers, by method."""
 
 
-def _field_first(error: str, kind: type[msgspec.Struct]) -> str:
-    """Return msgspec's `error` about a message of this kind with the name of the field in front."""
+def _field_first(error: str, message: msgspec.Struct) -> str:
+    """Return msgspec's `error` about `message` between the name of the field and its value."""
     match = re.fullmatch(r"(.*) - at `\$\[(\d+)\].*`", error, re.DOTALL)
     place = int(match[2]) - 1 if match is not None else -1  # the first element is the tag
-    if match is None or not 0 <= place < len(kind.__struct_fields__):
+    if match is None or not 0 <= place < len(message.__struct_fields__):
         return error
-    return f"{kind.__struct_fields__[place]}: {match[1].replace('`', chr(39))}"
+    field = message.__struct_fields__[place]
+    return f"{field}: {match[1].replace('`', chr(39))}, got {getattr(message, field)!r:.40}"
 
 
 def _guarded(method: str) -> Any:
@@ -117,7 +118,7 @@ class GuardedPlanner(Planner[Any, Any]):
             try:
                 decode(encode(found), kind)
             except (MalformedFrame, TypeError, ValueError, OverflowError, msgspec.MsgspecError) as error:
-                why = _field_first(str(error), type(found))
+                why = _field_first(str(error), found)
                 raise self._failed(method, f"its {kind.__name__} cannot be sent: {why}") from None
             self._check_address(method, found)
         if isinstance(found, Command) and found.peer not in (None, *self._others):
