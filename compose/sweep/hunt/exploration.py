@@ -74,11 +74,11 @@ class Hunt:
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
         self.slowest: dict[tuple[int, int], tuple[float, CorpusEntry]] = {}
-        """The inputs whose runs used most of a bound, with its share, by the number of bounds and its place."""
+        """The inputs whose runs used most of a bound, with its share, by how many bounds and which."""
         self.seen: set[str] = set()
         """The states that the runs have reached."""
         self.runs = self.processes = self.refused = 0
-        """The numbers of inputs, of those that also ran as processes, and of those that are not run to an end."""
+        """The numbers of inputs, of those also run as processes, and of those not run to an end."""
 
     def run(self, is_over: Callable[[Hunt], bool]) -> FoundBreach | None:
         """Search until `is_over`, and return the first input that breaks an invariant, shrunk.
