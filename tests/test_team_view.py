@@ -186,7 +186,7 @@ def test_tandem_figures_draws_a_team_and_says_in_one_line_what_is_not_of_teams(
     assert drawn.status == 0, drawn.err
     assert {path.name for path in (copy / "figures").iterdir()} == {"trajectory.svg", "errors.svg"}
     assert drawn.err == (
-        "tandem figures: no meetings, phase-1, plan, encounter, ranges, robot: "
+        "tandem figures: no meetings, phases, geometry, phase-1, plan, encounter, ranges, robot: "
         "the robots of a team share all measurements, and form no pairs\n"
     )
     plane = (copy / "figures" / "trajectory.svg").read_text()

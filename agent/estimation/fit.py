@@ -120,6 +120,8 @@ class Fit(NamedTuple):
     def delay(self) -> tuple[float, float]:
         """The delay (s) of all ranges after the odometry, and its standard deviation; 0 without a prior."""
         column, prior = self.problem.measured.delayed, self.problem.noise.priors.range_delay
+        if not prior:
+            return 0.0, 0.0
         return prior * float(self.constants[column]), prior * float(self.constant_sigmas[column])
 
     @property
