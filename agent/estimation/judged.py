@@ -7,7 +7,12 @@ from typing import Literal, NamedTuple, get_args
 
 from agent.estimation.fit import Fit, with_told_priors
 from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
-from agent.estimation.gaussian.consistency import HIGHEST_LEVEL, chi2_p_value, consistency_test
+from agent.estimation.gaussian.consistency import (
+    HIGHEST_LEVEL,
+    chi2_p_value,
+    consistency_test,
+    rejecting_p_value,
+)
 from agent.estimation.gaussian.joint_claims import Displacement, decisive_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import m2_of
@@ -106,6 +111,8 @@ class Judged(NamedTuple):
     """The poses that have to be accurate: index, whose, and the largest sigma (rad) of the heading."""
     confidence: float
     """The least probability of the pose."""
+    rejected: bool | None = None
+    """True if that test of a pair counts against the peer; None if there are too few ranges for that."""
     rivals_of: tuple[int, ...] = ()
     """The robots of which rivals are looked for."""
     displaced: Displacement | None = None
@@ -149,9 +156,12 @@ def of_pair(
     mission, role = config.mission, config.role
     robot, ids = (0, (config.robot, config.peer)) if role == "a" else (1, (config.peer, config.robot))
     required = required_mutual_ranges(mission.noise) if user in FIRST_CLAIMS else 0
+    enough = sufficient_mutual_ranges(mission.noise)
     places = len(pair.mutual_places)
     own_heading = config.heading_accuracy if places < ENOUGH_FOR_HEADING else HEADING_ACCURACY
     best = scored[0]
+    test = consistency_test(best.fit, pair, robot) if places >= required else None
+    counting = test if places >= enough else None
     return Judged(
         user=user,
         robot=robot,
@@ -162,10 +172,11 @@ def of_pair(
         ranges=places,
         required=required,
         stated=to_second_order(planning_hypothesis(best), m2_of(config)),
-        inconsistency=consistency_test(best.fit, pair, robot) if places >= required else None,
+        inconsistency=test,
         accuracy=mission.accuracy,
         headings=tuple([(i, f"{ids[i]}'s", own_heading if i == robot else HEADING_ACCURACY) for i in (0, 1)]),
         confidence=mission.confidence,
+        rejected=None if counting is None else counting.p_value < rejecting_p_value(mission.noise),
         rivals_of=(robot,),
     )
 

@@ -9,7 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.claim import BEFORE_SEARCH, CONDITIONS, Blocked, Condition, blocked, profiles, rivals
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES, rejecting_p_value
+from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import beginning, m2_of, own_measurements, pair_of
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, doubt
@@ -20,7 +20,7 @@ from agent.estimation.gaussian.planning_hypotheses import (
     to_second_order,
 )
 from agent.estimation.gaussian.search import search
-from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, User, of_pair, sufficient_mutual_ranges
+from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, User, of_pair
 from agent.estimation.knowledge import Attempt, Belief, Knowledge
 from agent.estimation.posterior import PAIR, Posterior, settled
 from protocol.messages import Localised, Undecided, Verdict
@@ -118,13 +118,12 @@ def _searched(
     p_values = [attempt.p_value, test.p_value if test is not None else None]
     least = min([one for one in p_values if one is not None], default=None)
     verdict: Verdict | None = None
-    if test is not None and len(measured.mutual_places) >= sufficient_mutual_ranges(measured.noise):
-        failed = test.p_value < rejecting_p_value(measured.noise)
-        failures = attempt.inconsistent_searches + 1 if failed else 0
+    if judged is not None and judged.rejected is not None:
+        failures = attempt.inconsistent_searches + 1 if judged.rejected else 0
         attempt = replace(attempt, inconsistent_searches=failures, p_value=least)
         if failures >= INCONSISTENT_SEARCHES:
             own = own_measurements(knowledge).thinned_after()
-            doubted = doubt(own, measured, 0 if knowledge.config.role == "a" else 1)
+            doubted = doubt(own, measured, judged.robot)
             verdict = test if doubted is None else Undecided(doubted.reason())
     match blocking:
         case _ if judged is None or verdict is not None:
