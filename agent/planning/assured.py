@@ -57,7 +57,7 @@ class Assured(LogPlanner):
             return state
         match state.task:
             case tasks.Orbital() | tasks.Travelling():
-                return self.steps(state).phase3(state, self.joint_manoeuvres)
+                return self._steps(state).phase3(state, self.joint_manoeuvres)
             case tasks.Resting():
                 return phase3_turns.decided(state, self.last_manoeuvre)
             case tasks.Listening() | tasks.Surveying("peer") if is_planning_tick(state):

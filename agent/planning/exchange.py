@@ -174,7 +174,7 @@ class LogPlanner(Planner[RobotState, Report]):
             case tasks.Orbiting(None) | tasks.Resting() | tasks.Done():  # most ticks
                 return state
             case tasks.Orbital():
-                return self.steps(state).phase2(state, task, ranged)
+                return self._steps(state).phase2(state, task, ranged)
             case tasks.Searching(beacon):
                 measured = state.in_contact if beacon == "peer" else ranged
                 seeking = range_seeking.onward(state, task, measured, self.MANOEUVRES)
@@ -182,19 +182,19 @@ class LogPlanner(Planner[RobotState, Report]):
                     return state.doing(seeking)
                 if beacon == "peer":
                     return state.doing(tasks.Waiting())
-                return self.steps(state).phase1(state, self.MANOEUVRES)
+                return self._steps(state).phase1(state, self.MANOEUVRES)
             case tasks.ThirdPoint(_, origin) if state.odometry != origin:
-                return self.steps(state).phase1(state, self.MANOEUVRES)
+                return self._steps(state).phase1(state, self.MANOEUVRES)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
                 return phase3_turns.after_last_manoeuvre(state, task)
             case tasks.Asleep() if observation.anchor_range is not None:
                 return phase1_anchor.begun(state, observation.anchor_range)
             case tasks.Asleep():
-                return self.steps(state).unranged(state)
+                return self._steps(state).unranged(state)
             case _:
                 return self._sense(state, ranged)
 
-    def steps(self, state: RobotState) -> Steps:
+    def _steps(self, state: RobotState) -> Steps:
         """Return the steps for the sensors of the mission."""
         return self.CORRECTED if state.estimator.corrects_poses else self.DEAD_RECKONED
 

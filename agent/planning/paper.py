@@ -41,7 +41,7 @@ class Paper(LogPlanner):
             return state
         match state.task:
             case Orbiting():
-                return self.steps(state).phase3(state, None)
+                return self._steps(state).phase3(state, None)
             case Resting():
                 return self._decide_phase3(state)
             case _:
