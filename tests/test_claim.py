@@ -10,7 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from agent.estimation.claim import CONDITIONS, Blocked, Condition, blocked, claim
-from agent.estimation.gaussian import pair
+from agent.estimation.gaussian import followed_pair
 from agent.estimation.judged import Judged, User
 from compose.launch.in_process import run_mission
 from protocol.messages import Localised
@@ -29,7 +29,7 @@ def judged() -> Judged:
         return found
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(pair, "blocked", remembered)
+        patch.setattr(followed_pair, "blocked", remembered)
         run_mission(scenario_of(SIGMA, 4))
     return seen[-1]
 

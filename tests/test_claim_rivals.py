@@ -11,7 +11,7 @@ import pytest
 import tandem
 from agent.estimation.claim import Blocked, Condition, blocked
 from agent.estimation.claim import rivals as no_rivals
-from agent.estimation.gaussian import claim_rivals, pair
+from agent.estimation.gaussian import claim_rivals, followed_pair
 from agent.estimation.judged import Judged
 from agent.planning import active_sensing
 from agent.planning.assured import Assured
@@ -61,7 +61,7 @@ def test_the_next_manoeuvre_is_planned_with_the_rival_that_blocks_a_claim(
         planned.append(hypotheses)
         return active_sensing.plan_together(hypotheses, *args)
 
-    monkeypatch.setattr(pair, "blocked", remembered)
+    monkeypatch.setattr(followed_pair, "blocked", remembered)
     monkeypatch.setattr(Assured, "joint_manoeuvres", lambda _, *args: plan_together(*args))
     assert_localised(run_mission(scenario_of(SIGMA, 382, reach=1.5)))
     assert rivals

@@ -11,7 +11,7 @@ import pytest
 from msgspec.structs import replace
 
 import tandem
-from agent.estimation.gaussian import pair
+from agent.estimation.gaussian import followed_pair
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Belief
@@ -356,7 +356,7 @@ def test_nothing_is_claimed_by_a_fit_that_still_moves(monkeypatch: pytest.Monkey
         still = [one._replace(fit=one.fit._replace(last_step=0.5)) for one in found.hypotheses]
         return found._replace(hypotheses=tuple(still))
 
-    monkeypatch.setattr(pair, "search", searched)
+    monkeypatch.setattr(followed_pair, "search", searched)
     recording = run_mission(scenario_of(SIGMA, SHORT, max_ticks=ticks + 2))
     assert summary(recording, "in-process", None)["outcome"] == "undecided"
     assert all(

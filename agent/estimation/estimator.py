@@ -2,7 +2,7 @@
 
 `exact_estimator` and `gaussian.gaussian_estimator` implement it. Planners do not ask which of the two they
 have: the mission's noise selects it, in `planning.state`. Only the steps of `assured` under noise plan with
-covariances, and take them from `gaussian.own_anchor` and `gaussian.pair`.
+covariances, and take them from `gaussian.own_anchor` and `gaussian.followed_pair`.
 """
 
 from __future__ import annotations

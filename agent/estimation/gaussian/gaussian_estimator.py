@@ -12,9 +12,9 @@ from agent.estimation.closed_forms import Placement
 from agent.estimation.estimator import AnchorEstimate, Estimator, PairEstimate
 from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit
+from agent.estimation.gaussian.followed_pair import believed
 from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.gaussian.own_anchor import followed
-from agent.estimation.gaussian.pair import believed
 from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Knowledge
 from protocol.messages import Observation, Undecided, Verdict
