@@ -35,6 +35,11 @@ SLOWEST_SHARE = 0.1
 """The share of inputs that are changes of those that came nearest to a computed bound."""
 NOISY_SLOWER = 20.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks."""
+LONG_TICKS = 300
+"""The ticks from which on most of the time of exact sensors grows with the square of the ticks.
+
+A meeting that does not end tests all its ranges again in each tick.
+"""
 
 
 class CorpusEntry(NamedTuple):
@@ -45,13 +50,10 @@ class CorpusEntry(NamedTuple):
 
     @property
     def share(self) -> float:
-        """The frequency of its changes, relative to others: it is larger if its run is shorter.
-
-        A meeting that does not end tests all its ranges in each tick, so twice the ticks take up to four
-        times the time.
-        """
-        slower = NOISY_SLOWER if is_noisy(self.table) else 1.0
-        return 1.0 / (1 + self.known.ticks) ** 2 / len(self.known.robots) / slower
+        """The frequency of its changes, relative to others: it is larger if its run is shorter."""
+        ticks = 1 + self.known.ticks
+        slower = NOISY_SLOWER if is_noisy(self.table) else 1.0 + ticks / LONG_TICKS
+        return 1.0 / ticks / len(self.known.robots) / slower
 
 
 class FoundBreach(NamedTuple):
@@ -74,11 +76,11 @@ class Hunt:
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
         self.slowest: dict[tuple[int, int], tuple[float, CorpusEntry]] = {}
-        """The inputs whose runs used most of a bound, with its share, by how many bounds and which."""
+        """The inputs whose runs used most of a bound, with the share, by the number of bounds and place."""
         self.seen: set[str] = set()
         """The states that the runs have reached."""
         self.runs = self.processes = self.refused = 0
-        """The numbers of inputs, of those also run as processes, and of those not run to an end."""
+        """The numbers of inputs, of those that also ran as processes, and of those that have no result."""
 
     def run(self, is_over: Callable[[Hunt], bool]) -> FoundBreach | None:
         """Search until `is_over`, and return the first input that breaks an invariant, shrunk.
