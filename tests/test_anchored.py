@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,11 +11,14 @@ import pytest
 from agent.estimation.following import ClaimRule
 from agent.estimation.gaussian.beacon_guesses import predicted
 from agent.estimation.gaussian.consistency import chi2_p_value
+from agent.estimation.gaussian.search import search
+from agent.estimation.posterior import certainties
 from compose.errors import UserError
 from compose.recording.estimating.calibration import ASSUMED, calibrated_by_fit
 from compose.recording.estimating.estimate_rows import estimate_csv
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import (
     FixedAnchor,
     Numbers,
@@ -25,6 +29,7 @@ from compose.recording.ranging.range_recording import (
     TruePath,
 )
 from compose.recording.ranging.range_steps import relative
+from tests.range_tables import circling, written_csv
 from tests.test_estimate import NEES_99_9
 
 ANCHORS = (
@@ -171,3 +176,13 @@ def test_the_radios_of_one_robot_are_calibrated_without_truth() -> None:
 def test_the_p_value_of_a_chi_square_is_that_of_its_distribution() -> None:
     assert chi2_p_value(18.307, 10) == pytest.approx(0.05, abs=1e-3)
     assert chi2_p_value(3.940, 10) == pytest.approx(0.95, abs=3e-3)
+
+
+def test_an_anchor_with_a_sigma_has_a_certainty_like_a_robot(tmp_path: Path) -> None:
+    """Robots that survey others beside it ask for that of each anchor that is not surveyed."""
+    tables = circling(4.0)
+    tables["anchors"][3]["sigma"] = 0.3
+    used = measurements(read_ranges(written_csv(tmp_path, tables)), None, None).until(7)
+    found = search(used)
+    assert (used.robots, found.located) == (("r", "D"), (0,))
+    assert [one.poses for one in certainties(found)] == [1, 1]

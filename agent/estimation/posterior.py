@@ -233,13 +233,13 @@ class Certainty(NamedTuple):
 
 
 def certainties(found: Posterior) -> list[Certainty]:
-    """Return the certainty of each located robot.
+    """Return the certainty of each located robot, and of the anchors with a sigma, which are the last ones.
 
     Hypotheses that differ in others only count as one, the most probable of them. That is exact for
     ambiguities that are independent of each other, of which not all combinations are known.
     """
     result = []
-    for i in range(len(found.located)):
+    for i in range(len(found.hypotheses[0].fit.poses) if found.hypotheses else 0):
         poses: list[Hypothesis] = []
         for one in found.hypotheses:
             if not any(same(one.fit, other.fit)[i] for other in poses):
