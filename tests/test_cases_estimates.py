@@ -31,6 +31,7 @@ from compose.recording.ranging.range_recording import RecordedRobot, RobotOdomet
 from protocol.motion import wrap
 from tests.commands import tandem
 from tests.series import series
+from tests.test_anchored import ANCHORS, driven
 from tests.test_estimate import simulated, with_ranges
 from tests.test_follow import messages_of, written
 
@@ -130,6 +131,17 @@ def test_of_two_robots_the_one_in_another_unit_is_named(
     increments = s.odometry.increments * np.array((dx, dx, turn))
     s = s._replace(odometry=s.odometry._replace(increments=increments))
     assert says in measurements(recording._replace(robots=(r, s)), None, None, None).doubt
+
+
+@pytest.mark.parametrize(("anchors", "suspected"), [(4, True), (2, False)])
+def test_clockwise_turns_are_suspected_by_ranges_to_three_anchors(anchors: int, suspected: bool) -> None:
+    recording = driven(ANCHORS[:anchors], sigma=0.05)
+    assert measurements(recording, None, None, None).doubt == ""
+    (robot,) = recording.robots
+    increments = robot.odometry.increments * np.array((1.0, -1.0, -1.0))
+    robot = robot._replace(odometry=robot.odometry._replace(increments=increments))
+    doubt = measurements(recording._replace(robots=(robot,)), None, None, None).doubt
+    assert ("are turns clockwise?" in doubt) == suspected
 
 
 @pytest.mark.parametrize(("factor", "suspected"), [(11.0, False), (39.37, True)])

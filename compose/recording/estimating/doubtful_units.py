@@ -2,7 +2,7 @@
 
 Over a part of its path, a robot's ranges to an anchor determine where the anchor is in the frame of the
 odometry, and the factor between ranges and odometry. The places of two anchors in that frame give the factor
-between ranges and positions of anchors. Nothing is converted: a user is told what the data suggest.
+between ranges and positions of anchors; those of three tell left from right. Nothing is converted: a user is told what the data suggest.
 """
 
 from __future__ import annotations
@@ -90,6 +90,8 @@ class _Factors(NamedTuple):
 
     degrees: bool
     """True if the turns of odometry are in degrees."""
+    clockwise: bool
+    """True if they are clockwise: three anchors are mirrored in the frame of the odometry."""
     by_odometry: list[float]
     """The logarithms of the factors of ranges to odometry."""
     by_anchors: list[float]
@@ -115,6 +117,8 @@ def _doubt(robots: Sequence[_Factors], bound: float) -> str:
     """
     if any(one.degrees for one in robots):
         return "the turns of odometry agree with the ranges only as degrees: are they in degrees?"
+    if any(one.clockwise for one in robots):
+        return "odometry and ranges agree only if left and right are exchanged: are turns clockwise?"
     located = [factor for one in robots for factor in one.by_anchors]
     by_odometry = _factor(_by_odometry(robots))
     by_anchors = _factor(float(np.median(located))) if located else bound
@@ -191,7 +195,29 @@ def _of_robot(recording: RangeRecording, robot: int) -> _Factors | None:
         for one, other in combinations(fits, 2)
         if one.part == other.part and one.anchor != other.anchor
     ]
-    return _Factors(2 * degrees > len(fits), [math.log(one.factor) for one in fits], by_anchors)
+    triples = [three for three in combinations(fits, 3) if len({one.part for one in three}) == 1]
+    mirrored = [_is_mirrored(*three) for three in triples]
+    clockwise = 2 * sum(mirrored) > len(mirrored)
+    return _Factors(2 * degrees > len(fits), clockwise, [math.log(one.factor) for one in fits], by_anchors)
+
+
+def _is_mirrored(*three: _Group) -> bool:
+    """Return whether the places of three anchors are nearer to the mirror image of theirs than to theirs.
+
+    They must be nearer by the factor DECISIVE: anchors on a line, and robots that hardly move, tell nothing.
+    """
+    found, told = [
+        np.array(places) for places in zip(*[(one.place, one.anchor) for one in three], strict=True)
+    ]
+    found, told = found - np.mean(found), told - np.mean(told)
+    off = [np.sum(np.abs(found - _turned(one, found))) for one in (told, np.conj(told))]
+    return bool(off[0] > DECISIVE * off[1])
+
+
+def _turned(places: Numbers, others: Numbers) -> Numbers:
+    """Return `places` (complex, around 0) turned to be as near as can be to `others`."""
+    product = np.sum(np.conj(places) * others)
+    return places * (product / max(abs(product), TINY))
 
 
 def _groups(recording: RangeRecording, robot: int, turn_unit: float) -> Iterator[_Group]:
