@@ -27,7 +27,7 @@ from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.estimating.sound_odometry import sound
 from compose.recording.estimating.true_poses import true_pose, with_bridged_truth
 from compose.recording.ranging.range_files import read_ranges
-from compose.recording.ranging.range_recording import RecordedRobot, RobotOdometry, TruePath
+from compose.recording.ranging.range_recording import FixedAnchor, RecordedRobot, RobotOdometry, TruePath
 from protocol.motion import wrap
 from tests.commands import tandem
 from tests.series import series
@@ -142,6 +142,13 @@ def test_clockwise_turns_are_suspected_by_ranges_to_three_anchors(anchors: int, 
     robot = robot._replace(odometry=robot.odometry._replace(increments=increments))
     doubt = measurements(recording._replace(robots=(robot,)), None, None, None).doubt
     assert ("are turns clockwise?" in doubt) == suspected
+
+
+@pytest.mark.parametrize("seed", [10, 12, 31])
+def test_a_straight_path_does_not_tell_left_from_right(seed: int) -> None:
+    """Places on the wrong side fitted best by chance, and a good recording was refused."""
+    on_the_left = FixedAnchor("B", 4.3, 6.6), FixedAnchor("C", 7.3, 9.4), FixedAnchor("D", 11.6, 10.0)
+    assert doubtful_units(driven(on_the_left, turn_rate=0.0, sigma=0.05, seed=seed)) == ""
 
 
 @pytest.mark.parametrize(("factor", "suspected"), [(11.0, False), (39.37, True)])
