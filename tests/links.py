@@ -171,8 +171,13 @@ def _slope(gap: complex, turned: complex) -> Array:
 
 
 def _is_probable(residuals: Array) -> bool:
-    """Return whether the chi-square of `residuals` is as small as LEAST_SIGMAS says; three were fitted."""
+    """Return whether the chi-square of `residuals` is as small as LEAST_SIGMAS says; three were fitted.
+
+    With three ranges or fewer, nothing contradicts a claim.
+    """
     free = len(residuals) - 3
+    if free < 1:
+        return True
     spread = 2.0 / (9.0 * free)  # Wilson and Hilferty, 1931
     normal: float = (math.cbrt((residuals**2).sum() / free) - (1.0 - spread)) / math.sqrt(spread)
     return normal < LEAST_SIGMAS

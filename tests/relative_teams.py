@@ -129,8 +129,8 @@ def row_of_claims(robots: int, sigma: float, found: Sequence[Result]) -> list[st
     return [
         *(str(robots), f"{sigma:g}", str(len(found))),
         *[str(sum(one.outcome == name for one in found)) for name in ("localised", "wrong")],
-        f"{median(ticks):.0f} / {max(ticks)}",
-        f"{rms(errors):.2g} / {max(errors):.2g}",
+        f"{median(ticks):.0f} / {max(ticks)}" if ticks else "",
+        f"{rms(errors):.2g} / {max(errors):.2g}" if errors else "",
         f"{fmean(nees):.2f}" if nees else "",
         f"{rms(errors) / rms(bounds):.2f}" if bounds else "",
     ]

@@ -36,7 +36,7 @@ LARGEST_STRAY_SHARE = 0.15
 """The largest fraction of ranges that may be strays, in addition to the outliers that were told."""
 
 EARLY_SIGMAS = 3.0
-"""The least delay of ranges, in standard deviations below 0, which says that the odometry is late."""
+"""The number of standard deviations by which ranges must be early for the odometry to be taken for late."""
 
 NORMAL_RATIO = -0.5 * WRONG_SIGMAS**2
 """The log-likelihood ratio of a rival where the likelihood is normal."""
@@ -299,7 +299,6 @@ CONDITIONS = (
 
 BEFORE_SEARCH = tuple([one for one in CONDITIONS if not one.last])
 """The conditions that a robot asks in each tick. If they hold, it searches the whole plane, and asks all."""
-
 
 WITHOUT_FITS = tuple([one for one in CONDITIONS if one not in (profiles, parts, rivals)])
 """The conditions that take no fits of their own: enough while something else holds back the claim."""

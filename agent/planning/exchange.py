@@ -67,9 +67,10 @@ def observed(state: RobotState, observation: Observation) -> RobotState:
 
 def _reported_log(state: RobotState) -> MotionLog:
     """Return the log of the robot, falsified if its configuration contains an attack."""
-    attack, ends = state.config.attack, (state.own_anchor.done_tick, state.belief.encounter_tick)
+    attack = state.config.attack
     if attack is None:
         return state.log
+    ends = state.own_anchor.done_tick, state.belief.encounter_tick
     return false_reports.falsified_log(state.log, attack, *ends, state.config.mission.period)
 
 

@@ -14,7 +14,6 @@ from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
 from agent.planning.strides import is_planning_tick
 from agent.planning.tasks import Homing, Straight, Surveying
-from protocol.messages import BranchKind
 
 MISLEADING = -8.0
 """The smallest plausible log-likelihood of the ticks without detection.
@@ -77,9 +76,9 @@ def continued(state: RobotState, manoeuvres: Manoeuvres | None = None) -> RobotS
             return homing.begun(state)
         return state.doing(Straight("anchor", state.odometry, latest.range))
     if is_anchor_known(state):
-        kind: BranchKind = "circle" if len(state.log.ranges) == 2 else "three-ranges"
         first = state.tick if found.done_tick is None else found.done_tick
-        return phase2_pursuit.begun(replace(state, own_anchor=replace(found, kind=kind, done_tick=first)))
+        ended = replace(found, kind="three-ranges", done_tick=first)
+        return phase2_pursuit.begun(replace(state, own_anchor=ended))
     since, objective = next_objective(state, "anchor", (path_of(state.log, 0, state.tick, mission),))
     command = plan_alone(anchor_planning_hypotheses(state), mission, objective=objective)
     return state.doing(Surveying("anchor", command, since))

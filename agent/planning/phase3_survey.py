@@ -12,11 +12,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.followed_pair import followed
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.mission_measurements import (
-    MANY_MUTUAL_RANGES,
-    has_failed,
-    m2_of,
-)
+from agent.estimation.gaussian.mission_measurements import MANY_MUTUAL_RANGES, has_failed, m2_of
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.planning import homing, phase2_pursuit, range_seeking
 from agent.planning.active_sensing import CONTINUED, next_objective, plan_together

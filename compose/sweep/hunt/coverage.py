@@ -36,14 +36,14 @@ def note_conditions() -> None:
 
 
 class TooLongError(Exception):
-    """The mission lasts longer than its planners were told."""
+    """The mission lasts beyond the last tick that a WatchedPlanner was given."""
 
 
 class WatchedPlanner:
     """A planner that notes in `seen` which conditions kept a robot from its claim, and in which task."""
 
     def __init__(self, config: RobotConfig, seen: set[str], last: float) -> None:
-        """`last` is the tick after which `command` raises TooLongError."""
+        """Begin with the planner of `config`; after the tick `last`, `command` raises TooLongError."""
         self._planner: Planner[Any, Any] = planner_of(config)
         self._seen, self._last = seen, last
         _unmet.clear()  # what an earlier run has left
