@@ -212,6 +212,17 @@ def test_anchors_with_a_sigma_are_estimated_and_written_as_the_next_estimate_rea
         assert math.dist(position, (true.x, true.y)) < 0.4
 
 
+@pytest.mark.parametrize(("robot", "window"), [("s", None), ("r", (0.0, 5.0))])
+def test_a_robot_without_ranges_is_not_said_to_have_another_clock(
+    robot: str, window: tuple[float, float] | None, tmp_path: Path
+) -> None:
+    tables = circling(12.0)
+    tables["odometry"] += [row | {"robot": "s"} for row in tables["odometry"]]
+    tables["ranges"] = [row for row in tables["ranges"] if float(str(row["t"])) > 6.0]
+    with pytest.raises(UserError, match=f"one robot needs .*: {robot} has ranges to no anchor$"):
+        estimate(written_csv(tmp_path, tables), robots=[robot], window=window)
+
+
 def test_ranges_that_no_radio_can_have_cost_no_claim(tmp_path: Path) -> None:
     tables = circling(12.0)
     for row in [row for row in tables["ranges"] if row["to"] == "B"][8:14]:

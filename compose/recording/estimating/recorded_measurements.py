@@ -354,9 +354,13 @@ class NoAnchors(UserError):
 
 
 def _check_anchors(part: RangeRecording, recording: RangeRecording) -> None:
-    """Raise NoAnchors for one robot, or for two, in `part`. Of more robots, some may be estimated."""
-    if (t := recording.ranges.t).size and not part.ranges.t.size:
-        begin, end = part.span
+    """Raise NoAnchors for one robot, or for two, in `part`. Of more robots, some may be estimated.
+
+    It also raises NoAnchors if all ranges of these robots in `recording` are of other times than odometry.
+    """
+    whole = recording.part([one.id for one in part.robots], -math.inf, math.inf)
+    t, (begin, end) = whole.ranges.t, whole.span
+    if t.size and not ((t >= begin) & (t <= end)).any():
         when = f"{t[0]:.15g} s to {t[-1]:.15g} s, and odometry of {begin:.15g} s to {end:.15g} s"
         raise NoAnchors(f"{part.source}: ranges are of {when}: stamps have to be in s, on one clock")
     count, placed = len(part.robots), part.with_places()
