@@ -448,6 +448,15 @@ def test_headings_of_a_compass_are_named(exchanged: str, degrees: bool, tmp_path
     assert said.endswith("? They have to be in rad, counter-clockwise")
 
 
+def test_the_first_poses_of_a_robot_that_turns_on_the_spot_are_not_taken_for_clockwise(
+    tmp_path: Path,
+) -> None:
+    poses = [(0.0, 0.0, 0.0), (0.001, 0.0, 0.0), (0.001, 0.0, 0.8), (0.0017, -0.0007, 0.8)]
+    rows = [{"robot": "a", "t": 0.1 * k, "x": x, "y": y, "heading": h} for k, (x, y, h) in enumerate(poses)]
+    tables = {"poses": rows, "anchors": TABLES["anchors"], "ranges": TABLES["ranges"][1:]}
+    assert len(read_ranges(written_csv(tmp_path, tables)).robots[0].odometry.t0) == 3
+
+
 @pytest.mark.parametrize("unit", [1e3, 1e6])
 def test_times_in_ms_are_named(unit: float, tmp_path: Path) -> None:
     rows = track(headings="unwrapped", begin=ORIGIN)

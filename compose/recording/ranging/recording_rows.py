@@ -178,6 +178,12 @@ HEADINGS = {
 """The kinds of headings, by the factor that makes them rad counter-clockwise; the first is what is needed."""
 AGREEING = 0.9
 """The part of the way from which on it is along the headings. Those of another kind have less than half."""
+FEWEST_COURSES = 8
+"""The least number of increments by which headings are compared.
+
+With two or three, another kind may agree by chance: at the beginning of a stream, a robot that turns on the
+spot would be refused for the jitter of its poses.
+"""
 UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """The place in a Covariance6 of each element of the matrix."""
 
@@ -319,6 +325,8 @@ class RecordingBuilder:
     def _check_headings(self) -> None:
         """Raise BadRecording if the headings of a robot agree with its motion only in others of HEADINGS."""
         for robot, (length, sums) in self._courses.items():
+            if len(self._odometry[robot]) < FEWEST_COURSES:
+                continue
             for along, meaning in zip(sums, HEADINGS.values(), strict=True):
                 if abs(along) > AGREEING * length > 2.0 * abs(sums[0]):
                     what = f"the headings of {robot} agree with its motion only {meaning}"
