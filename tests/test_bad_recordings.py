@@ -84,7 +84,7 @@ def test_an_invalid_row_is_one_line_with_its_place(
         ("EDGE_SE2 1 A0 A1 0 0 0 1 nan 0 1 0 1", ", line 1: cov_xy: 'nan' is not a number"),
         (
             "VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 B0 1 1",
-            ", line 2: B is neither a robot with odometry nor a known anchor; the recording has no anchors",
+            ", line 2: B is neither a robot with odometry nor a known anchor; robots: A; anchors: none",
         ),
         ("VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 L0 1 0", ", line 2: variance: 0 is not positive"),
         (

@@ -417,11 +417,12 @@ class RecordingBuilder:
         )
 
     def _unknown(self, name: str, names: Sequence[str]) -> str:
-        what = "is neither a robot with odometry nor a known anchor"
-        if len(names) == len(self._odometry):
-            return f"{what}; the recording has no anchors"
-        robots, anchors = listed(names[: len(self._odometry)]), listed(names[len(self._odometry) :])
-        return f"{what}; robots: {robots}; anchors: {anchors}{did_you_mean(name, names)}"
+        """Return that no robot or anchor has this `name`, and the `names` that there are, robots first."""
+        robots, anchors = [
+            listed(some) for some in (names[: len(self._odometry)], names[len(self._odometry) :])
+        ]
+        there = f"robots: {robots}; anchors: {anchors or 'none'}"
+        return f"is neither a robot with odometry nor a known anchor; {there}{did_you_mean(name, names)}"
 
     def _range_series(self, names: Sequence[str]) -> RangeSeries:
         radios = {name: i for i, name in enumerate(names)}
