@@ -268,7 +268,7 @@ def parts(judged: Judged) -> str:
 
 @condition("recording", last=True)
 def parts_before(judged: Judged) -> str:
-    """Since parts of the ranges disagreed last, the time has grown by a factor of {MORE_TIME:g}."""
+    """The time has grown by a factor of {MORE_TIME:g} since parts of the ranges disagreed last."""
     if judged.passed >= MORE_TIME * judged.disagreed:
         return ""
     since = judged.measured.period * (judged.passed - judged.disagreed)

@@ -103,7 +103,7 @@ class Following(NamedTuple):
     claimed: frozenset[str] = frozenset()
     """The robots that might have claimed their poses."""
     displacements: tuple[Displacement, ...] = ()
-    """How far each anchor seems to stand elsewhere, at the latest test."""
+    """The distance by which each anchor seems to stand elsewhere, at the latest test."""
     tested: int = 0
     """The number of ranges at that test."""
     doubted: int = 0

@@ -543,7 +543,7 @@ class Told(NamedTuple):
     limited: Vector
     """that after the limited step; shape (s,)"""
     by_unknowns: Matrix
-    """how the unknowns change it; shape (s, p)"""
+    """the effect of the unknowns on it; shape (s, p)"""
     weight: Matrix
     """the information; shape (s, s)"""
 
