@@ -151,6 +151,22 @@ def test_a_straight_path_does_not_tell_left_from_right(seed: int) -> None:
     assert doubtful_units(driven(on_the_left, turn_rate=0.0, sigma=0.05, seed=seed)) == ""
 
 
+@pytest.mark.parametrize("speed", [0.0, 0.1])
+def test_turns_of_a_robot_that_stands_or_drives_straight_are_not_suspected(speed: float) -> None:
+    """Each anchor may be on either side of a straight path: some such robots were suspected."""
+    (robot,) = driven(ANCHORS).robots
+    t0, count = robot.odometry.t0, len(robot.odometry.t0)
+    increments = np.tile((speed * (t0[1] - t0[0]), 0.0, 0.0), (count, 1))
+    straight = robot._replace(odometry=robot.odometry._replace(increments=increments))
+    for seed in range(20):
+        draws, ranges = np.random.default_rng(seed), driven(ANCHORS).ranges
+        places = np.array([complex(one.x, one.y) for one in ANCHORS])[ranges.second - 1]
+        away = places - complex(3.0 + seed / 10.0, 3.0) - speed * ranges.t
+        recording = driven(ANCHORS)._replace(robots=(straight,))
+        recording = with_ranges(recording, np.abs(away) + 0.1 * draws.standard_normal(len(away)))
+        assert doubtful_units(recording) == ""
+
+
 @pytest.mark.parametrize(("factor", "suspected"), [(11.0, False), (39.37, True)])
 def test_the_ranges_to_one_anchor_in_one_part_tell_of_units_only(factor: float, suspected: bool) -> None:
     """Odometry that slips looked like a factor of 11, and a good recording was refused."""

@@ -457,6 +457,20 @@ def test_the_first_poses_of_a_robot_that_turns_on_the_spot_are_not_taken_for_clo
     assert len(read_ranges(written_csv(tmp_path, tables)).robots[0].odometry.t0) == 3
 
 
+@pytest.mark.parametrize("turn_rate", [0.1, 0.6, -0.6])
+def test_headings_of_a_robot_that_drives_straight_and_spins_are_right(
+    turn_rate: float, tmp_path: Path
+) -> None:
+    """Taken as degrees, they hardly turn, as the way does: such robots that drive sideways were refused."""
+    rows = [
+        {"robot": "a", "t": k, "x": 0.1 * k, "y": 0.0, "heading": wrap(turn_rate * k + 1.0)}
+        for k in range(60)
+    ]
+    tables = {"poses": rows, "anchors": TABLES["anchors"], "ranges": TABLES["ranges"][1:]}
+    (robot,) = read_ranges(written_csv(tmp_path, tables)).robots
+    assert len(robot.odometry.t0) == 59
+
+
 @pytest.mark.parametrize("unit", [1e3, 1e6])
 def test_times_in_ms_are_named(unit: float, tmp_path: Path) -> None:
     rows = track(headings="unwrapped", begin=ORIGIN)

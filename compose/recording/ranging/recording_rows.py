@@ -184,6 +184,11 @@ FEWEST_COURSES = 8
 With two or three, another kind may agree by chance: at the beginning of a stream, a robot that turns on the
 spot would be refused for the jitter of its poses.
 """
+EXPLAINED = 3.0
+"""The factor by which headings of another kind must be nearer to the way than a single direction is.
+
+Headings taken as degrees hardly turn: a robot that drives straight, sideways, and spins agrees with them.
+"""
 UPPER = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
 """The place in a Covariance6 of each element of the matrix."""
 
@@ -239,7 +244,7 @@ class RecordingBuilder:
         self._truth: dict[str, list[TimedPose]] = {}
         self._poses: dict[str, TimedPose] = {}
         self._courses: dict[str, tuple[float, list[complex]]] = {}
-        """The way (m) of each robot with poses, and its sums along the headings as in each of HEADINGS."""
+        """The way (m) of each robot with poses, and its sums along x and the headings as in HEADINGS."""
         self._given = {row.anchor: row for row in anchors}
         self._anchors: dict[str, AnchorRow] = {}
         self._antennas: dict[str, AntennaRow] = {}
@@ -315,20 +320,22 @@ class RecordingBuilder:
     def _add_course(self, robot: str, start: Pose, end: Pose) -> None:
         """Add a way to the sums. Its direction relative to the heading is doubled: a robot may back up."""
         way, sums = complex(end.x - start.x, end.y - start.y), []
-        for unit in HEADINGS:
+        for unit in (0.0, *HEADINGS):
             heading = unit * start.heading + wrap(unit * (end.heading - start.heading)) / 2.0
             along = way * cmath.exp(-1j * heading)
             sums.append(along**2 / abs(along) if along else 0j)
-        length, before = self._courses.get(robot, (0.0, [0j] * len(HEADINGS)))
+        length, before = self._courses.get(robot, (0.0, [0j] * (1 + len(HEADINGS))))
         self._courses[robot] = length + abs(way), [one + more for one, more in zip(before, sums, strict=True)]
 
     def _check_headings(self) -> None:
         """Raise BadRecording if the headings of a robot agree with its motion only in others of HEADINGS."""
-        for robot, (length, sums) in self._courses.items():
+        for robot, (length, (straight, radians, *others)) in self._courses.items():
             if len(self._odometry[robot]) < FEWEST_COURSES:
                 continue
-            for along, meaning in zip(sums, HEADINGS.values(), strict=True):
-                if abs(along) > AGREEING * length > 2.0 * abs(sums[0]):
+            most_off = (length - abs(straight)) / EXPLAINED
+            for along, meaning in zip(others, [*HEADINGS.values()][1:], strict=True):
+                agreeing = length - abs(along) < most_off and abs(along) > AGREEING * length
+                if agreeing and AGREEING * length > 2.0 * abs(radians):
                     what = f"the headings of {robot} agree with its motion only {meaning}"
                     raise BadRecording(f"{self.source}: {what}? They have to be in rad, counter-clockwise")
 
