@@ -190,6 +190,14 @@ def test_ranges_of_other_times_than_the_odometry_are_named(until_s: float, tmp_p
         assert "stamps have to be in s, on one clock" in ended.err
 
 
+def test_a_window_without_ranges_is_not_said_to_be_of_another_clock(sample: RangeRecording) -> None:
+    begin, _ = sample.span
+    late = sample._replace(ranges=sample.ranges.rows(sample.ranges.t > begin + 10.0))
+    with pytest.raises(UserError) as error:
+        measurements(late, ["A"], None, (0.0, 5.0))
+    assert "clock" not in str(error.value)
+
+
 def test_anchors_with_a_sigma_are_estimated_and_written_as_the_next_estimate_reads_them(
     sample: RangeRecording, tmp_path: Path
 ) -> None:
