@@ -479,6 +479,16 @@ def test_times_in_ms_are_named(unit: float, tmp_path: Path) -> None:
     assert refused(written_csv(tmp_path, tables)).endswith("are times in ms? They have to be in s")
 
 
+def test_a_robot_that_stands_may_say_so_rarely(tmp_path: Path) -> None:
+    """Its increments of 12 s were taken for those of stamps in ms."""
+    stands = {"robot": "b", "x": 1.0, "y": 2.0, "heading": 0.5}
+    tables = {
+        "poses": [*track(headings="wrapped", begin=ORIGIN), *[stands | {"t": 12.0 * k} for k in range(12)]]
+    }
+    tables |= {"anchors": TABLES["anchors"], "ranges": TABLES["ranges"][1:]}
+    assert [one.id for one in read_ranges(written_csv(tmp_path, tables)).robots] == ["a", "b"]
+
+
 def test_a_folder_with_ranges_and_without_odometry_names_the_files_it_needs(tmp_path: Path) -> None:
     written_csv(tmp_path, {"ranges": TABLES["ranges"], "anchors": TABLES["anchors"]})
     needs = "poses.csv, odometry.csv, or poses-ROBOT.tum of each robot"

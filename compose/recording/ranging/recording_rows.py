@@ -392,8 +392,8 @@ class RecordingBuilder:
     def _check_times(self, recording: RangeRecording) -> None:
         """Raise BadRecording if stamps are missing, or not in s.
 
-        Then, all ranges of a pair, or all increments of a robot, are of one time, or most increments are so
-        long that there is no estimate in them.
+        Then, all ranges of a pair, or all increments of a robot, are of one time, or most increments that
+        move it are so long that there is no estimate in them.
         """
         paths = [(f"increments of {one.id}", one.odometry.t0, one.odometry.t1) for one in recording.robots]
         for pair, rows in recording.pairs().items():
@@ -403,10 +403,15 @@ class RecordingBuilder:
             if len(end) >= NOT_AT_ONCE and begin[-1] == end[0]:
                 all_of_them = f"all {len(end)} {what} are of {end[0]:.15g} s"
                 raise BadRecording(f"{self.source}: {all_of_them}: stamps are missing")
-            lasts = float(np.median(end - begin)) if len(end) >= NOT_AT_ONCE else 0.0
-            if lasts > LONG_GAP_S:
-                long = f"{what} last {lasts:.6g} s in the median, and {LONG_GAP_S:g} s is the limit"
-                raise BadRecording(f"{self.source}: {long}: are times in ms? They have to be in s")
+        for one in recording.robots:
+            moves = np.any(one.odometry.increments, axis=1)
+            lasts = float(np.median((one.odometry.t1 - one.odometry.t0)[moves])) if np.any(moves) else 0.0
+            if len(moves) >= NOT_AT_ONCE and lasts > LONG_GAP_S:
+                long = f"increments of {one.id} last {lasts:.6g} s in the median"
+                limit = f"{LONG_GAP_S:g} s is the limit"
+                raise BadRecording(
+                    f"{self.source}: {long}, and {limit}: are times in ms? They have to be in s"
+                )
 
     def _robot(self, name: str) -> RecordedRobot:
         rows, truth, antenna = self._odometry[name], self._truth.get(name), self._antennas.get(name)
