@@ -10,7 +10,6 @@ the claimed ones that fit the ranges of all robots best, has a probability of at
 from __future__ import annotations
 
 import argparse
-import math
 import random
 import sys
 import time
@@ -19,6 +18,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.smoother import Array
 from compose.launch.in_process import recorded
 from compose.recording.run import Run
@@ -41,13 +41,11 @@ COLUMNS = (
     "missions", "inconsistent", "claims of others", "wrong", "claims at the link", "wrong there", "agreeing",
     "wrong, agreeing",
 )  # fmt: skip
-"""What is counted of each attack."""
+"""The columns of the table: the numbers that are counted of each attack."""
 MOST_TICKS = 1500
 """The ticks after which a mission ends: robots that contradict each other drive on."""
 ITERATIONS = 8
 """The number of Gauss-Newton steps, which begin near the minimum."""
-LEAST_SIGMAS = 3.09
-"""The one-sided normal quantile of LEAST_PROBABLE."""
 LEAST_PROBABLE = 0.001
 """The probability of the chi-square below which ranges contradict a claim."""
 
@@ -105,7 +103,7 @@ class Ranged(NamedTuple):
     robot: int
     """The place of the robot among those with claims."""
     at: complex
-    """Its position in m, relative to its start."""
+    """The position of the robot in m, relative to its start."""
     peer: int | None
     """The place of the other robot; None for the anchor."""
     there: complex
@@ -171,16 +169,12 @@ def _slope(gap: complex, turned: complex) -> Array:
 
 
 def _is_probable(residuals: Array) -> bool:
-    """Return whether the chi-square of `residuals` is as small as LEAST_SIGMAS says; three were fitted.
+    """Return whether the chi-square of `residuals` has at least LEAST_PROBABLE; three unknowns were fitted.
 
     With three ranges or fewer, nothing contradicts a claim.
     """
     free = len(residuals) - 3
-    if free < 1:
-        return True
-    spread = 2.0 / (9.0 * free)  # Wilson and Hilferty, 1931
-    normal: float = (math.cbrt((residuals**2).sum() / free) - (1.0 - spread)) / math.sqrt(spread)
-    return normal < LEAST_SIGMAS
+    return free < 1 or chi2_p_value(float((residuals**2).sum()), free) >= LEAST_PROBABLE
 
 
 def counted(run: Run, at_link: list[str], sigma: float) -> Counter[str]:

@@ -480,7 +480,7 @@ def test_times_in_ms_are_named(unit: float, tmp_path: Path) -> None:
 
 
 def test_a_robot_that_stands_may_say_so_rarely(tmp_path: Path) -> None:
-    """Its increments of 12 s were taken for those of stamps in ms."""
+    """The increments of 12 s of such a robot were taken for those of stamps in ms."""
     stands = {"robot": "b", "x": 1.0, "y": 2.0, "heading": 0.5}
     tables = {
         "poses": [*track(headings="wrapped", begin=ORIGIN), *[stands | {"t": 12.0 * k} for k in range(12)]]

@@ -297,8 +297,8 @@ def with_told_priors(fit: Fit) -> Fit:
     """Return `fit` with a covariance of which a noise level below 1 multiplies only the part of white errors.
 
     Small residuals show that white errors are small, not that biases and slow errors are smaller than their
-    priors. With a gain K and white variances R, the part of these is
-    K R K', which is the derivative of the covariance by the logarithm of R.
+    priors. With a gain K and white variances R, the part of these is K R K', which is the
+    derivative of the covariance by the logarithm of R.
     """
     if not fit.level < 1.0:
         return fit

@@ -74,7 +74,7 @@ def displacements(fit: Fit, used: JointMeasurements) -> Iterator[Displacement]:
     at the told position: where a few ranges admit two places, that covariance is small, too. An anchor
     without ranges is left out.
     """
-    ends = [used.radios[one] for one in np.unique(used.ranges.radio).tolist()]
+    ends = [used.radios[one] for one in sorted(set(used.ranges.radio.tolist()))]
     for name in [one for one in used.anchors if one in used.robots or any(one in each for each in ends)]:
         measured, k, told = _estimating(name, used)
         if told.sigma == math.inf:

@@ -213,11 +213,14 @@ def _is_mirrored(*three: _Group) -> bool:
     path, rho = np.concatenate([one.path for one in three]), np.concatenate([one.rho for one in three])
     lever = np.concatenate([np.full(len(one.path), one.anchor - three[0].anchor) for one in three])
     turns = np.arange(0.0, math.tau, math.tau / BEARINGS).tolist()
-    costs = []
-    for each in (path, np.conj(path)):
-        starts = _starts(each[: len(three[0].path)], three[0].rho, turns=turns)
-        costs.append(_least(each, lever, rho, starts, [0, 1, 2])[1])
-    return costs[0] > MIRRORED * costs[1]
+
+    def cost(path: Numbers) -> float:
+        starts = _starts(path[: len(three[0].path)], three[0].rho, turns=turns)
+        return _least(path, lever, rho, starts, [0, 1, 2])[1]
+
+    alone = np.average([one.cost for one in three], weights=[len(one.path) for one in three])
+    told = cost(path)  # the mirror image cannot fit better than each anchor for itself
+    return bool(told > MIRRORED * alone and told > MIRRORED * cost(np.conj(path)))
 
 
 def _groups(recording: RangeRecording, robot: int, turn_unit: float) -> Iterator[_Group]:

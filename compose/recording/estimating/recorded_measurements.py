@@ -36,7 +36,7 @@ from compose.recording.ranging.range_recording import (
 )
 from compose.recording.ranging.range_steps import (
     NEARLY_ALL,
-    UNMOVED,
+    WITHOUT_ODOMETRY,
     Flags,
     RangeSteps,
     speeds,
@@ -222,7 +222,7 @@ def measurements(
         if relative is None:
             _check_anchors(part, recording)
         unused = Counter(found.unused)
-        unused[UNMOVED] += outside
+        unused[WITHOUT_ODOMETRY] += outside
         doubt = doubtful_units(part) if doubt is None else doubt
         return msgspec.structs.replace(found, doubt=doubt, unused=dict(+unused))
 

@@ -24,7 +24,7 @@ from compose.recording.ranging.range_recording import (
 )
 
 Flags = NDArray[np.bool_]
-UNMOVED = "without odometry of all robots"
+WITHOUT_ODOMETRY = "without odometry of all robots"
 """The reason for which ranges are left out that are of other times than the odometry."""
 
 
@@ -74,7 +74,7 @@ def steps_of(recording: RangeRecording, period_s: float = 1.0, spacing_s: float 
         locked((kept.t - t[step]) / (t[step + 1] - t[step])),
         {
             "within a second after another": len(known.t) - len(kept.t),
-            UNMOVED: int(np.count_nonzero(~inside)),
+            WITHOUT_ODOMETRY: int(np.count_nonzero(~inside)),
             "in a gap of the odometry": int(np.count_nonzero(in_gap)),
         },
         locked(skipped_s),
