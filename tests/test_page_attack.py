@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import asyncio
+import json
 import re
 from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
@@ -17,11 +20,14 @@ from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from compose.view.recorded import scenes, scenes_of
 from compose.view.scene import Scene
+from compose.view.web.server import news_events
+from compose.view.web.site import of_folder
 from compose.view.web.sources import Recorded
 from protocol.attack import Attack
 from protocol.messages import Inconsistent
 from protocol.motion import travelled
 from tests.browser import Open, inks, picture, scrub_to, watching
+from tests.commands import BOUND_S
 
 HALVED = Attack("scale", 0.5, "orbit")
 LABELS = "document.getElementById('canvas').labels.map((one) => one.text)"
@@ -97,6 +103,23 @@ def test_without_the_ground_truth_nothing_is_known_to_be_false(recording: Path, 
     assert journals.known.reported_logs["a"].through > 0
     shown = scenes(journals.setup, journals.known)
     assert all(player.reported is None for scene in shown for player in scene.players)
+
+
+def test_what_an_attack_cost_arrives_with_the_scene_that_tells_it(recording: Path) -> None:
+    """Without the scene, the page would show none until it had fetched it."""
+
+    async def told() -> dict[str, Any]:
+        site = of_folder(recording)
+        (show,) = site.shows.values()
+        news = news_events(site, show.name, show.version)
+        await anext(news)
+        show.known.add_costs(["Believed, a would be 4.40 m off."])
+        show.revised()
+        return dict(json.loads((await anext(news)).removeprefix(b"data: "))["show"])
+
+    update = asyncio.run(asyncio.wait_for(told(), BOUND_S))
+    assert update["from"] == update["last"]
+    assert [scene["tick"] for scene in update["scenes"]] == [update["last"]]
 
 
 # --- the page -----------------------------------------------------------------------------------------

@@ -200,7 +200,7 @@ class _Answers:
         return _json(await self._computed(series, setup, show.known, first, last, robots, check))
 
     async def news(self, request: Request) -> Response:
-        stream = _news(self._site, request.query_params.get("show"), _number(request, "since", 0))
+        stream = news_events(self._site, request.query_params.get("show"), _number(request, "since", 0))
         return StreamingResponse(stream, media_type="text/event-stream")
 
 
@@ -314,10 +314,11 @@ def _json(value: object, status: int = 200) -> Response:
         raise UserError(str(error)) from None
 
 
-async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[bytes]:
+async def news_events(site: Site, name: str | None, version: int) -> AsyncIterator[bytes]:
     """Yield server-sent events: the list of runs when it changes, and updates of the show called `name`.
 
-    An update has the state of the run and the first tick that changed since `version`.
+    An update has the state of the run, the first tick that changed since `version`, and the scene of the
+    latest tick if the run goes on or nothing else has changed.
     """
     listed: dict[str, Any] | None = None
     state: dict[str, Any] | None = None
@@ -334,12 +335,8 @@ async def _news(site: Site, name: str | None, version: int) -> AsyncIterator[byt
             if since is not None or now != state:
                 state = now
                 head = show.head
-                event["show"] = {
-                    **now,
-                    "from": since,
-                    "robots": len(show.setup.robots),
-                    "scenes": scenes(show.setup, show.known, head, head) if show.live else (),
-                }
+                told = scenes(show.setup, show.known, head, head) if show.live or since == head else ()
+                event["show"] = {**now, "from": since, "robots": len(show.setup.robots), "scenes": told}
         if event:
             yield b"data: " + msgspec.json.encode(event) + b"\n\n"
         await asyncio.sleep(LIVE_POLL_S if site.waiting else IDLE_POLL_S)
