@@ -42,6 +42,7 @@ from compose.recording.ranging.range_steps import (
     speeds,
     steps_of,
 )
+from compose.recording.ranging.unseen_motion import UnseenMotion, unseen_motion
 from compose.recording.reasons import listed
 from protocol.noise import Noise
 
@@ -89,6 +90,8 @@ class MeasuredRobot(NamedTuple):
     anchors: tuple[FixedAnchor, ...]
     """The anchors to which it has ranges, that with the most first; there may be none."""
     sound: SoundOdometry
+    unseen: UnseenMotion
+    """The motion of its antenna within increments."""
 
     @property
     def id(self) -> str:
@@ -262,7 +265,8 @@ def _measurements(
     lasts = np.median(np.concatenate([one.odometry.t1 - one.odometry.t0 for one in part.robots]))
     noise = assumed.of_fit(float(lasts) / period)
     anchors = [used.anchors_of(i)[:MOST_USED_ANCHORS] for i in range(len(names))]
-    ranges = list(_ranges(used, steps, assumed, anchors))
+    unseen = [unseen_motion(robot.odometry) for robot in part.robots]
+    ranges = list(_ranges(used, steps, assumed, anchors, unseen))
     placed = {one.id: one for own in anchors for one in own}.values()
     places = {
         one.id: AnchorPlace(0.0, 0.0, one.sigma)
@@ -286,7 +290,7 @@ def _measurements(
     }
     return Measurements(
         source=part.source,
-        robots=tuple(map(MeasuredRobot, recorded, anchors, prepared)),
+        robots=tuple(map(MeasuredRobot, recorded, anchors, prepared, unseen)),
         joint=of_rows(places, starts, manoeuvres, ranges, noise, period),
         t0=t0,
         ticks_per_epoch=ticks,
@@ -307,9 +311,16 @@ def ticks_per_epoch(recording: RangeRecording, noise: Noise) -> int:
 
 
 def _ranges(
-    used: RangeRecording, steps: RangeSteps, assumed: AssumedNoise, anchors: list[tuple[FixedAnchor, ...]]
+    used: RangeRecording,
+    steps: RangeSteps,
+    assumed: AssumedNoise,
+    anchors: list[tuple[FixedAnchor, ...]],
+    unseen: list[UnseenMotion],
 ) -> Iterator[MeasuredRow]:
-    """Yield the ranges in the plane between robots and to their `anchors`, each at the nearest tick."""
+    """Yield the ranges in the plane between robots and to their `anchors`, each at the nearest tick.
+
+    The sigma of a range within increments is that of the range and of the `unseen` motion of its robots.
+    """
     ranges, count, noise = steps.ranges, len(used.robots), assumed.noise
     heights = np.array([*[one.antenna[2] for one in used.robots], *[one.height for one in used.anchors]])
     rho, ratio = levelled(ranges.range, heights[ranges.first] - heights[ranges.second])
@@ -317,6 +328,11 @@ def _ranges(
     if assumed.stated:
         sigma = np.where(np.isfinite(ranges.sigma), ranges.sigma, sigma)
     sigma = np.maximum(sigma, SIGMA_FLOOR) * ratio
+    away = np.stack([one.sigmas(ranges.t)[:, 0] for one in unseen])
+    mutual = ranges.second < count
+    variance = np.square(away[ranges.first, np.arange(len(ranges.t))])
+    variance[mutual] += np.square(away[ranges.second[mutual], np.flatnonzero(mutual)])
+    sigma = np.sqrt(np.square(sigma) + variance)
     ticks = steps.step + (steps.fraction >= 0.5)
     own, radios = [{one.id for one in each} for each in anchors], used.radios
     columns = [each.tolist() for each in (ranges.first, ranges.second, ticks, rho, sigma)]

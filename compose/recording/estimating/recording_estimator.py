@@ -19,6 +19,7 @@ from compose.errors import UserError
 from compose.recording.estimating.estimate_rows import FinalHypothesis, PoseEstimateRow, pose_row
 from compose.recording.estimating.recorded_measurements import Measurements, numerics
 from compose.recording.ranging.range_recording import Numbers, RecordedRobot
+from protocol.mission import HEADING_ACCURACY
 from protocol.motion import wrap
 
 
@@ -93,7 +94,7 @@ class RecordingEstimator:
         """Return the estimate at the end of the epoch with this `number`, from 0 on, in their order."""
         used = msgspec.structs.replace(measured.until(number), solver=self._solver)
         found = self._following = self._following.after(used, self.rule, "recording", used.robots)
-        return _result(measured, number, used, found.known, found.reasons)
+        return _result(measured, number, used, found.known, found.reasons, self.rule.accuracy)
 
 
 def _result(
@@ -102,6 +103,7 @@ def _result(
     used: JointMeasurements,
     found: Posterior,
     reasons: Mapping[str, str],
+    accuracy: float,
 ) -> EstimateEpoch:
     """Return the estimate at the end of an epoch, by what was `found` with what is `used`."""
     t, part, sure = float(measured.ends[number]), used.some(found.located), certainties(found)
@@ -113,6 +115,10 @@ def _result(
         for one in measured.robots
     }
     posed = [one for one in measured.robots if not without[one.id]]
+    unseen = {one.id: one.unseen.sigmas(np.array([t]))[0] for one in posed}
+    best = found.hypotheses[0].fit if found.hypotheses else None
+    far = {name: far_between(best, place[name], one, accuracy) for name, one in unseen.items() if best}
+    reasons = {name: reason or far.get(name, "") for name, reason in reasons.items()}
     without = {name: why for name, why in without.items() if why}
     reason = [f"{one.id}: {reasons[one.id]}" for one in posed if reasons.get(one.id)]
     reason += [f"{name} is undetermined: {why}" for name, why in without.items()]
@@ -120,7 +126,8 @@ def _result(
     claims = {one.id: reasons.get(one.id) == "" for one in measured.robots}
     fits = [with_told_priors(each.fit) for each in found.hypotheses]
     centres = [
-        {one.id: _centre(one.recorded, place[one.id], fit, used.origin) for one in posed} for fit in fits
+        {one.id: _centre(one.recorded, place[one.id], fit, used.origin, unseen[one.id]) for one in posed}
+        for fit in fits
     ]
     rows = [
         pose_row(one.recorded, t, sure[place[one.id]], *centres[0][one.id], claim=claims[one.id])
@@ -142,7 +149,7 @@ def _result(
 
 
 def _centre(
-    robot: RecordedRobot, k: int, fit: Fit, origin: tuple[float, float]
+    robot: RecordedRobot, k: int, fit: Fit, origin: tuple[float, float], unseen: Numbers
 ) -> tuple[tuple[float, float, float], Numbers]:
     """Return the pose of a robot's centre in <W> and its covariance; its antenna is robot `k` of a fit."""
     (x, y, heading), own = fit.poses[k].tolist(), slice(3 * k, 3 * k + 3)
@@ -152,4 +159,17 @@ def _centre(
     if not all(map(math.isfinite, pose)):
         raise FloatingPointError("a pose is not finite")
     centred = np.array(((1.0, 0.0, offset.imag), (0.0, 1.0, -offset.real), (0.0, 0.0, 1.0)))
-    return pose, centred @ fit.covariance[own, own] @ centred.T
+    more = np.diag(np.square(unseen[[0, 0, 1]]))
+    return pose, centred @ (fit.covariance[own, own] + more) @ centred.T
+
+
+def far_between(fit: Fit, k: int, unseen: Numbers, accuracy: float) -> str:
+    """Return why the pose of robot `k` is too inaccurate with its `unseen` motion; empty if it is not.
+
+    `accuracy` is the largest sigma (m) of a position that may be claimed.
+    """
+    x, y, heading = np.diagonal(fit.covariance)[3 * k : 3 * k + 3].tolist()
+    away, turned = unseen.tolist()
+    if x + y + 2.0 * away**2 <= accuracy**2 and heading + turned**2 <= HEADING_ACCURACY**2:
+        return ""
+    return f"between two poses of its odometry, it may be {away:.2g} m and {turned:.2g} rad from the arc"

@@ -155,13 +155,13 @@ def dead_reckoned(odometry: RobotOdometry, t: Numbers) -> Numbers:
         return np.zeros((len(t), 3))
     row = np.searchsorted(odometry.t0, t, side="right") - 1
     begun = np.maximum(row, 0)
-    part = within(odometry.increments[begun], np.where(row < 0, 0.0, _fraction(odometry, begun, t)))
+    part = within(odometry.increments[begun], np.where(row < 0, 0.0, over_of(odometry, begun, t)))
     place = at[begun] + np.exp(1j * turned[begun]) * (part[:, 0] + 1j * part[:, 1])
     return np.stack((place.real, place.imag, turned[begun] + part[:, 2]), axis=1)
 
 
-def _fraction(odometry: RobotOdometry, row: Places, t: Numbers) -> Numbers:
-    """Return the fraction of the increment `row` that is over at `t`, from 0 to 1; 1 if it takes no time."""
+def over_of(odometry: RobotOdometry, row: Places, t: Numbers) -> Numbers:
+    """Return the fraction of each increment `row` that is over at `t`, from 0 to 1; 1 if it takes no time."""
     lasts = odometry.t1[row] - odometry.t0[row]
     over = (t - odometry.t0[row]) / np.where(lasts > 0.0, lasts, 1.0)
     fraction: Numbers = np.clip(np.where(lasts > 0.0, over, 1.0), 0.0, 1.0)
