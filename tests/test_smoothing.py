@@ -17,20 +17,17 @@ from numpy.typing import NDArray
 from agent.estimation import smoother
 from agent.estimation.fit import Fit, Start, deviation, fits, held_fits
 from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
-from agent.estimation.gaussian import joint_ranges, odometry_noise
+from agent.estimation.gaussian import joint_ranges
 from agent.estimation.gaussian.claim_rivals import FAR_ANCHOR, _holding
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import (
-    OdometryNoiseModel,
-    Projection,
-    Ticks,
     Track,
-    attributed,
-    spread,
+    effect_covariance,
+    pose_effects,
+    position_variances,
     track,
-    wander,
 )
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.gaussian.search import starts_about
@@ -73,14 +70,6 @@ def variances(drift: VelocityNoise, measured: Track) -> Array:
     return np.array([drift.variances(v, omega) for v, omega in ticks]).T.ravel()
 
 
-def model_of(path: Track, drift: VelocityNoise, measured: Track | None = None) -> OdometryNoiseModel:
-    """Return the noise model of a path without constant errors, by default of one that is as measured."""
-    measured = path if measured is None else measured
-    q = odometry_noise.variances(measured.v, measured.omega, drift)
-    correction = np.stack((path.v - measured.v, path.omega - measured.omega))
-    return wander(path, correction, np.zeros((0, 2, len(path.v))), q)
-
-
 # --- the path -----------------------------------------------------------------------------------------
 
 
@@ -100,53 +89,38 @@ def test_a_track_is_where_the_steps_lead(driven: list[tuple[float, float]], peri
     )
 
 
-class Looks(NamedTuple):
-    """Rows along a path, and the derivatives of their observations."""
-
-    path: Track
-    rows: Projection
-    by_noise: Array
-    """derivatives by the noise in v at each tick, then in omega; shape (rows, 2 k)"""
-
-
-@st.composite
-def looks(draw: st.DrawFn) -> Looks:
-    """Draw rows that observe positions in any direction with any scale, or headings."""
-    path = track_of(draw(manoeuvres), draw(periods))
-    k = len(path.v)
-    kinds = st.tuples(st.integers(0, k), lengths, lengths, st.booleans())
-    seen = draw(st.lists(kinds, min_size=1, max_size=6))
-    ticks = np.array([tick for tick, *_ in seen], np.intp)
-    heading = np.array([turned for *_, turned in seen])
-    u = np.where(heading, 0.0, np.array([(x, y) for _, x, y, _ in seen]).T)
-    rows = Projection.positions(path, Ticks.of(ticks, k), u)
-    rows.weights[0, heading] = path.period
-
-    def looked_at(noise: Array) -> Array:
-        other = track(path.v + noise[:k], path.omega + noise[k:], path.period)
-        return np.where(heading, other.heading[ticks], u[0] * other.x[ticks] + u[1] * other.y[ticks])
-
-    return Looks(path, rows, derivative(looked_at, np.zeros(2 * k)))
-
-
 @some
-@given(looks(), drifts)
-def test_noise_of_the_odometry_spreads_along_the_path(look: Looks, drift: VelocityNoise) -> None:
-    covariance = look.by_noise @ np.diag(variances(drift, look.path)) @ look.by_noise.T
-    left, right = spread(model_of(look.path, drift), look.rows)
-    both, ticks = left.mT @ right, look.rows.ticks.tick
-    assert np.where(ticks[:, None] >= ticks, both, both.mT) == near(covariance)
-
-
-@some
-@given(looks(), drifts, seeds)
-def test_what_is_seen_off_its_place_is_attributed_to_the_noise_before(
-    look: Looks, drift: VelocityNoise, seed: int
+@given(manoeuvres, periods, st.data())
+def test_a_pose_changes_with_the_odometry_as_its_effects_say(
+    driven: list[tuple[float, float]], period: float, data: st.DataObject
 ) -> None:
-    off = np.random.default_rng(seed).normal(size=len(look.rows.ticks.tick))
-    errors = attributed(model_of(look.path, drift), look.rows, off)
-    expected = variances(drift, look.path) * (look.by_noise.T @ off)
-    assert errors.ravel() == near(expected)
+    path, k = track_of(driven, period), len(driven)
+    tick = data.draw(st.integers(0, k))
+    since = data.draw(st.integers(0, tick))
+
+    def pose(noise: Array) -> Array:
+        other = track(path.v + noise[:k], path.omega + noise[k:], period)
+        return np.array((other.x[tick], other.y[tick], other.heading[tick]))
+
+    expected = derivative(pose, np.zeros(2 * k)).reshape(3, 2, k)
+    expected[..., :since] = 0.0
+    assert pose_effects(path, since, tick) == near(expected)
+
+
+@some
+@given(manoeuvres, periods, drifts, seeds)
+def test_noise_of_the_odometry_spreads_along_the_path(
+    driven: list[tuple[float, float]], period: float, drift: VelocityNoise, seed: int
+) -> None:
+    path, k = track_of(driven, period), len(driven)
+    patterns, white = np.random.default_rng(seed).normal(size=(3, 2, k)), variances(drift, path)
+    of_positions = position_variances(path, white.reshape(2, k), patterns)
+    for tick in range(k + 1):
+        effects = pose_effects(path, 0, tick)
+        by_noise, by_constant = effects.reshape(3, 2 * k), np.einsum("mek,iek->im", patterns, effects)
+        expected = by_noise @ np.diag(white) @ by_noise.T + by_constant @ by_constant.T
+        assert effect_covariance(effects, white.reshape(2, k), patterns) == near(expected)
+        assert of_positions[tick] == pytest.approx(expected[0, 0] + expected[1, 1], rel=1e-6, abs=1e-9)
 
 
 # --- the ranges ---------------------------------------------------------------------------------------

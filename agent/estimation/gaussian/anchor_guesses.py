@@ -20,7 +20,7 @@ from agent.estimation.gaussian.odometry_noise import (
     constant_errors,
     expected_variances,
     is_noisy,
-    wander,
+    position_variances,
 )
 from agent.estimation.gaussian.range_model import mixture
 
@@ -79,15 +79,8 @@ def _odometry_variance(own: JointMeasurements) -> Array:
     white = expected_variances(v, omega, noise, path.period)
     if path.extra is not None:
         white += path.extra
-    model = wander(path, np.zeros(path.shift.shape), constant_errors(v, omega, noise), white)
-    lever, position = path.period, np.zeros(len(path.x))
-    if model.sums is not None:
-        turn, bx, by, xx, _, yy = model.sums
-        position = xx + yy - 2.0 * lever * (path.y * bx - path.x * by)
-        position += lever**2 * (path.x**2 + path.y**2) * turn
-    for turned, x, y in model.moves[:-1]:
-        position = position + np.square(x - lever * path.y * turned) + np.square(y + lever * path.x * turned)
-    along: Array = 0.5 * np.maximum(position, 0.0)[np.minimum(own.ranges.tick, len(path.v))]
+    variances = position_variances(path, white, constant_errors(v, omega, noise))
+    along: Array = 0.5 * variances[np.minimum(own.ranges.tick, len(path.v))]
     return along
 
 

@@ -13,21 +13,19 @@ from agent.estimation.elementary import eigh, inverted, product, quadratic, solv
 from agent.estimation.gaussian.mission_measurements import path_of
 from agent.estimation.gaussian.odometry_noise import (
     Array,
-    Projection,
     Track,
-    constant_effects,
     constant_errors,
+    effect_covariance,
     expected_variances,
     is_noisy,
-    spread,
-    wander,
+    pose_effects,
 )
 from agent.estimation.gaussian.planning_hypotheses import covariance_of
 from agent.estimation.smoother import Singular
 from agent.peer.motion_log import MotionLog
 from protocol.messages import Localised
 from protocol.mission import HEADING_ACCURACY, Mission
-from protocol.motion import Pose, compose, inverse, wrap
+from protocol.motion import Pose, compose, inverse, rotated, wrap
 from protocol.noise import Noise
 from protocol.rounding import TOLERANCE
 
@@ -164,11 +162,9 @@ def _drift(path: Track, since: int, turn: float, noise: Noise) -> Array:
         return np.zeros((3, 3))
     patterns = constant_errors(path.v, path.omega, noise)
     white = expected_variances(path.v, path.omega, noise, path.period)
-    model = wander(path, np.zeros((2, len(path.v))), patterns, white).since(since)
-    rows = Projection.pose(path, len(path.v), turn)
-    constant = constant_effects(model, rows)[:-1]
-    left, right = spread(model, rows)
-    return product(left.T, right) + product(constant.T, constant)
+    effects, (c, s) = pose_effects(path, since, len(path.v)), (math.cos(turn), math.sin(turn))
+    effects[0], effects[1] = rotated(c, s, effects[0], effects[1])
+    return effect_covariance(effects, white, patterns)
 
 
 def _p_value(chi2: float) -> float:

@@ -1,23 +1,18 @@
 """The path from a robot's odometry, and the covariance that odometry noise causes along it.
 
-Noise at one tick moves every later position, so errors are correlated along the path. The covariance between
-any two ticks follows from sums up to the earlier one.
-
-All arrays may have further axes in front, of paths that are computed at once: "..." in their shapes.
+An error in a tick moves all later poses together, like a rigid body.
 """
 
 from __future__ import annotations
 
 import math
-from functools import cached_property
 from typing import NamedTuple
 
-import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.compiled import address, library
-from agent.estimation.elementary import sin, tan
+from agent.estimation.elementary import product, sin, tan
 from agent.estimation.smoother import SLIGHT
 from protocol.noise import Noise, VelocityNoise
 
@@ -29,19 +24,19 @@ class Track(NamedTuple):
     """A robot's odometry over [0, k], in the frame of tick 0."""
 
     v: Array
-    """The forward velocity (m/s) over each tick; shape (..., k)."""
+    """The forward velocity (m/s) over each tick; shape (k,)."""
     omega: Array
-    """The angular velocity (rad/s) over each tick; shape (..., k)."""
+    """The angular velocity (rad/s) over each tick; shape (k,)."""
     period: float
     """The sampling period T_s (s)."""
     place: Array
-    """The x and y (m) at each tick; shape (..., 2, k + 1)."""
+    """The x and y (m) at each tick; shape (2, k + 1)."""
     heading: Array
-    """The heading (rad, not wrapped) at each tick; shape (..., k + 1)."""
+    """The heading (rad, not wrapped) at each tick; shape (k + 1,)."""
     shift: Array
-    """The displacement per unit of v (s) over each tick; shape (..., 2, k)."""
+    """The displacement per unit of v (s) over each tick; shape (2, k)."""
     slip: Array | None = None
-    """The angle (rad) from the chord of eq. (1a) to the displacement of each tick; shape (..., k).
+    """The angle (rad) from the chord of eq. (1a) to the displacement of each tick; shape (k,).
 
     None: 0.
     """
@@ -50,13 +45,13 @@ class Track(NamedTuple):
 
     @property
     def x(self) -> Array:
-        """The x (m) at each tick; shape (..., k + 1)."""
-        return np.asarray(self.place[..., 0, :], np.float64)
+        """The x (m) at each tick; shape (k + 1,)."""
+        return np.asarray(self.place[0], np.float64)
 
     @property
     def y(self) -> Array:
-        """The y (m) at each tick; shape (..., k + 1)."""
-        return np.asarray(self.place[..., 1, :], np.float64)
+        """The y (m) at each tick; shape (k + 1,)."""
+        return np.asarray(self.place[1], np.float64)
 
     @property
     def content(self) -> tuple[object, ...]:
@@ -101,56 +96,8 @@ def ratio_of_chord(half: Array) -> Array:
     return ratio
 
 
-def corrected(measured: Array, correction: Array, period: float, slip: Array | None = None) -> Track:
-    """Return the path with the v and omega that were measured, and a correction; shape (..., 2, k) each."""
-    velocities = measured + correction
-    v, omega = velocities[..., 0, :], velocities[..., 1, :]
-    return track(v, omega, period, None if slip is None else slip + np.zeros_like(v))
-
-
 NO_TURN = 1e-20
 """An angle (rad) in place of 0, whose sine is itself."""
-
-
-def _summed(values: Array) -> Array:
-    """Return the sums of all values before each tick, along the last axis; (..., k) -> (..., k + 1)."""
-    sums = np.zeros((*values.shape[:-1], values.shape[-1] + 1))
-    np.add.accumulate(values, -1, out=sums[..., 1:])
-    return sums
-
-
-class OdometryNoiseModel(NamedTuple):
-    """Prefix sums from which the covariance of a path follows, for noise in its v and omega.
-
-    Noise e in omega at tick j moves the position at a later tick t, along u, by (lever - u . b_j) e, where
-    lever = T_s u . perp(p_t). Noise e in v moves it by u . shift_j e.
-    """
-
-    b: Array
-    """The vector b_j (m s) at each tick; shape (..., 2, k)."""
-    shift: Array
-    """The displacement per unit of v (s) at each tick; shape (..., 2, k)."""
-    moves: Array
-    """The prefix sums of the effects on heading, x and y of each constant error, of one sigma, and then of
-    the correction of the measured path; shape (..., m + 1, 3, k + 1)."""
-    variances: Array | None
-    """The variances of v and omega, (m/s)^2 and (rad/s)^2, at each tick; shape (..., 2, k). None without
-    white noise."""
-    sums: Array | None
-    """The prefix sums of six terms up to each tick; shape (..., 6, k + 1).
-
-    The terms are q_omega; the x and y of -q_omega b; the xx, xy and yy of q_omega b b' + q_v shift shift'.
-    """
-
-    def since(self, tick: int) -> OdometryNoiseModel:
-        """Return the model of a robot whose odometry was exact before `tick`."""
-        moves = self.moves - self.moves[:, :, tick : tick + 1]
-        moves[:, :, :tick] = 0.0
-        if self.variances is None or self.sums is None:
-            return self._replace(moves=moves)
-        variances, sums = self.variances.copy(), self.sums - self.sums[:, tick : tick + 1]
-        variances[:, :tick] = sums[:, :tick] = 0.0
-        return self._replace(moves=moves, variances=variances, sums=sums)
 
 
 def constant_errors(v: Array, omega: Array, noise: Noise) -> Array:
@@ -206,42 +153,60 @@ def is_noisy(noise: Noise) -> bool:
     return noise.priors.of_odometry or noise.wanders
 
 
-def wander(
-    path: Track, correction: Array, patterns: Array, variances: Array | None = None
-) -> OdometryNoiseModel:
-    """Return the prefix sums along `path`, for constant errors and white noise of that size.
+def rigid_effects(path: Track) -> Array:
+    """Return by how much v and omega of each tick move all later poses, like one rigid body; (3, 2, k).
 
-    `correction` is the difference of the path's v and omega from the measured ones; shape (..., 2, k).
+    They are the x and y (m) of its point at the origin, and the angle (rad), per m/s and rad/s.
     """
-    period, shift = path.period, path.shift
     # omega changes the length of the chord, and rotates it by half the angle by which it rotates the robot
-    slope = path.v * _shortening((0.5 * period) * path.omega, period)
-    across = (0.5 * period * SIGNS) * path.v[..., None, :]
-    b = across * shift[..., ::-1, :] - slope[..., None, :] * shift
-    b -= (period * SIGNS) * path.place[..., ::-1, 1:]
-    velocities = np.empty((*correction.shape[:-2], patterns.shape[-3] + 1, *correction.shape[-2:]))
-    velocities[..., :-1, :, :], velocities[..., -1, :, :] = patterns, correction
-    turned, moves = velocities[..., 1:, :], np.zeros((*velocities.shape[:-2], 3, shift.shape[-1] + 1))
-    rates = moves[..., 1:]
-    rates[..., :1, :] = turned
-    np.multiply(velocities[..., :1, :], shift[..., None, :, :], out=rates[..., 1:, :])
-    rates[..., 1:, :] -= turned * b[..., None, :, :]
-    np.add.accumulate(rates, -1, out=rates)
-    if variances is None:
-        return OdometryNoiseModel(b, shift, moves, None, None)
-    q_v, q_omega = variances[..., :1, :], variances[..., 1:, :]
-    terms = np.empty((*shift.shape[:-2], 6, shift.shape[-1]))
-    terms[..., :1, :] = q_omega
-    np.multiply(-q_omega, b, out=terms[..., 1:3, :])
-    along = q_v * shift
-    np.subtract(along * shift[..., :1, :], terms[..., 1:3, :] * b[..., :1, :], out=terms[..., 3:5, :])
-    last = along[..., 1, :] * shift[..., 1, :]
-    np.subtract(last, terms[..., 2, :] * b[..., 1, :], out=terms[..., 5, :])
-    return OdometryNoiseModel(b, shift, moves, variances, _summed(terms))
+    longer = path.v * _shortening((0.5 * path.period) * path.omega, path.period)
+    middle = 0.5 * (path.place[:, :-1] + path.place[:, 1:])
+    found = np.zeros((3, 2, len(path.v)))
+    found[:2, 0], found[2, 1] = path.shift, path.period
+    found[0, 1] = longer * path.shift[0] + path.period * middle[1]
+    found[1, 1] = longer * path.shift[1] - path.period * middle[0]
+    return found
 
 
-SIGNS = np.array(((1.0,), (-1.0,)))
-"""The signs of two components that are exchanged, or of the two robots."""
+def pose_effects(path: Track, since: int, tick: int) -> Array:
+    """Return by how much v and omega of each tick from `since` on move the pose at `tick`; (3, 2, k)."""
+    found = rigid_effects(path)
+    found[..., :since] = found[..., tick:] = 0.0
+    found[0] -= path.y[tick] * found[2]
+    found[1] += path.x[tick] * found[2]
+    return found
+
+
+def constant_effects(effects: Array, patterns: Array) -> Array:
+    """Return the effects of one sigma of each constant error, (m, 3), by those of v and omega in a tick."""
+    count = effects[0].size
+    return product(patterns.reshape(len(patterns), count), effects.reshape(3, count).T)
+
+
+def effect_covariance(effects: Array, white: Array, patterns: Array) -> Array:
+    """Return the covariance of what has these `effects`, (3, 3).
+
+    The errors of v and omega are white, with variances (2, k), and constant ones with `patterns`, (m, 2, k).
+    """
+    by_tick, constant = effects.reshape(3, white.size), constant_effects(effects, patterns)
+    return product(by_tick * white.ravel(), by_tick.T) + product(constant.T, constant)
+
+
+def position_variances(path: Track, white: Array, patterns: Array) -> Array:
+    """Return the sum of the variances (m^2) of x and y at each tick, (k + 1,), by errors since tick 0.
+
+    The errors are as in `effect_covariance`.
+    """
+    effects, rigid = rigid_effects(path), np.zeros((3, 3, len(path.x)))
+    by_white = np.add.reduce(effects[:, None] * effects * white, 2)
+    np.add.accumulate(by_white, -1, out=rigid[..., 1:])
+    for pattern in patterns:
+        constant = np.add.accumulate(np.add.reduce(effects * pattern, 1), -1)
+        rigid[..., 1:] += constant[:, None] * constant
+    x, y, turned = path.x, path.y, rigid[2, 2]
+    found: Array = rigid[0, 0] + rigid[1, 1] + 2.0 * (x * rigid[1, 2] - y * rigid[0, 2])
+    found += (np.square(x) + np.square(y)) * turned
+    return np.maximum(found, 0.0, out=found)
 
 
 def _shortening(half: Array, period: float) -> Array:
@@ -251,81 +216,6 @@ def _shortening(half: Array, period: float) -> Array:
     by_half = np.where(slight, half / -3.0, 1.0 / tan(safe) - 1.0 / safe)
     shortening: Array = (0.5 * period) * by_half
     return shortening
-
-
-class Ticks(msgspec.Struct, frozen=True, eq=False, dict=True):
-    """The ticks of N rows along a path."""
-
-    tick: Places
-    k: int
-    """The number of ticks of the path."""
-
-    @staticmethod
-    def of(tick: Places, k: int) -> Ticks:
-        """Return the ticks of rows along a path of `k` ticks. Those beyond it are taken as its last one."""
-        return Ticks(np.minimum(tick, k), k)
-
-    @cached_property
-    def _order(self) -> tuple[Places, Places]:
-        """The rows, the latest first, shape (N,), and the number of them after each tick, shape (k,)."""
-        order = np.argsort(-self.tick, kind="stable")
-        return order, np.searchsorted(-self.tick[order], -np.arange(self.k))
-
-    def sum_after(self, values: Array) -> Array:
-        """Return the sums over the rows after each tick; (..., N) -> (..., k)."""
-        latest_first, later = self._order
-        return np.asarray(_summed(values[..., latest_first])[..., later], np.float64)
-
-
-class Projection(NamedTuple):
-    """Linear functionals of a robot's trajectory, one for each of N rows: a tick, a direction and a lever."""
-
-    ticks: Ticks
-    weights: Array
-    """The lever on noise in omega (m s), T_s if the row is a heading, and the direction in the frame of the
-    odometry, or 0 if the row is of another robot; shape (..., 3, N)."""
-
-    @staticmethod
-    def positions(path: Track, ticks: Ticks, u: Array) -> Projection:
-        """Return the rows for the robot's position at `ticks` along `u`, shape (..., 2, N)."""
-        weights = np.empty((*u.shape[:-2], 3, u.shape[-1]))
-        place = path.place[..., ticks.tick]
-        lever = u[..., 1, :] * place[..., 0, :] - u[..., 0, :] * place[..., 1, :]
-        np.multiply(path.period, lever, out=weights[..., 0, :])
-        weights[..., 1:, :] = u
-        return Projection(ticks, weights)
-
-    @staticmethod
-    def pose(path: Track, tick: int, turn: float = 0.0) -> Projection:
-        """Return the rows for the x, y and heading at `tick`, with x and y rotated by `turn` (rad)."""
-        c, s = math.cos(turn), math.sin(turn)
-        ticks = Ticks.of(np.full(3, tick, np.intp), len(path.v))
-        rows = Projection.positions(path, ticks, np.array(((c, s, 0.0), (-s, c, 0.0))))
-        rows.weights[0, 2] = path.period
-        return rows
-
-
-def constant_effects(model: OdometryNoiseModel, rows: Projection) -> Array:
-    """Return the effect (m) of one sigma of each constant error, and that of the correction of the measured
-    path, on N rows; shape (..., m + 1, N)."""
-    moves = model.moves[..., rows.ticks.tick]
-    return np.asarray(np.add.reduce(moves * rows.weights[..., None, :, :], -2), np.float64)
-
-
-def spread(model: OdometryNoiseModel, rows: Projection) -> tuple[Array, Array]:
-    """Return factors of the covariance (m^2) of N rows from white odometry noise; shape (..., 3, N) each.
-
-    Element (i, j) of the covariance is the product of column i of the first and column j of the second, if
-    row i is not earlier than row j.
-    """
-    if model.sums is None:
-        return rows.weights, np.zeros(rows.weights.shape)
-    sums = model.sums[..., rows.ticks.tick][..., MATRIX, :]
-    return rows.weights, np.add.reduce(sums * rows.weights[..., None, :, :], -2)
-
-
-MATRIX = np.array(((0, 1, 2), (1, 3, 4), (2, 4, 5)))
-"""The places in `OdometryNoiseModel.sums` of the elements of the matrix of a tick."""
 
 
 class Errors(NamedTuple):
@@ -348,19 +238,3 @@ def rescaled(errors: Errors, told: Noise, other: Noise) -> Errors:
     if len(errors.constant) and len(constant):
         constant = errors.constant * was / np.where(now > 0.0, now, math.inf)
     return errors._replace(constant=constant)
-
-
-def attributed(model: OdometryNoiseModel, rows: Projection, residuals: Array) -> Array:
-    """Return the white errors of v and omega that explain `residuals` best; shape (..., 2, k).
-
-    The residuals are weighted by their inverse covariance; shape (..., N).
-    """
-    if model.variances is None:
-        return np.zeros(model.shift.shape)
-    after = rows.ticks.sum_after(rows.weights * residuals[..., None, :])
-    lever, u = after[..., 0, :], after[..., 1:, :]
-    white = np.empty(model.shift.shape)
-    np.add.reduce(u * model.shift, -2, out=white[..., 0, :])
-    np.subtract(lever, np.add.reduce(u * model.b, -2), out=white[..., 1, :])
-    white *= model.variances
-    return white

@@ -27,13 +27,10 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Errors,
-    OdometryNoiseModel,
-    Projection,
-    attributed,
     constant_effects,
-    corrected,
-    spread,
-    wander,
+    effect_covariance,
+    pose_effects,
+    track,
 )
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, mixture
 from agent.estimation.gaussian.range_weights import weighted_noise
@@ -102,9 +99,9 @@ class Encounter(NamedTuple):
     """The transposed pseudo-inverse of `root`; shape (3, 3)."""
     of_anchor: Array
     """The part of that covariance that is due to the anchor; shape (3, 3)."""
-    odometry: tuple[OdometryNoiseModel, Projection, Array, Array] | None
-    """The odometry noise since the last range to the anchor, the offset as rows, the effects of constant
-    errors on it, and these errors since then, shape (m, 2, k); None if it is exact."""
+    odometry: tuple[Array, Array, Array] | None
+    """The effects of v and omega since the last range to the anchor on the offset, (3, 2, k), the variances
+    of their white errors, (2, k), and their constant errors since then, (m, 2, k); None if it is exact."""
 
     def begun(self, own: Fit, z: Array) -> tuple[Array, tuple[Errors, ...]]:
         """Return the anchor (m) and the odometry errors for the whitened offset `z`, shape (3,)."""
@@ -112,9 +109,9 @@ class Encounter(NamedTuple):
         anchor = own.guess[:2] - product(self.of_anchor[:2], weights[:, None])[:, 0]
         if self.odometry is None:
             return anchor, own.start.errors
-        model, rows, effects, patterns = self.odometry
-        constant = product(effects, weights[:, None])[:, 0]
-        more = attributed(model, rows, weights) + summed(constant, patterns)
+        effects, white, patterns = self.odometry
+        constant = product(constant_effects(effects, patterns), weights[:, None])[:, 0]
+        more = white * summed(weights, effects) + summed(constant, patterns)
         (begun,) = own.start.errors
         return anchor, (Errors(begun.v + more[0], begun.omega + more[1], begun.constant),)
 
@@ -161,16 +158,14 @@ def _encounter(own: Fit, base: int, ticks: tuple[int, ...]) -> Encounter:
         earlier = own.ticks[own.ticks <= base]
         since = int(earlier[-1]) if len(earlier) else 0
         of, (errors,) = own.problem.measured, own.start.errors
-        correction = np.stack((errors.v, errors.omega)) + summed(errors.constant, of.patterns[0])
-        path = corrected(np.stack((of.v[0], of.omega[0])), correction, of.period, of.slip[0])
+        moved = np.stack((of.v[0], of.omega[0])) + np.stack((errors.v, errors.omega))
+        moved += summed(errors.constant, of.patterns[0])
         white = weighted_noise(of, np.full(of.v.shape, 1.0 - own.problem.noise.odometry_strays))[0]
-        model = wander(path, correction, of.patterns[0], white).since(since)
-        rows = Projection.pose(path, base)
-        effects, patterns = constant_effects(model, rows)[:-1], of.patterns[0].copy()
+        effects = pose_effects(track(moved[0], moved[1], of.period, of.slip[0]), since, base)
+        patterns = of.patterns[0].copy()
         patterns[:, :, :since] = 0.0
-        odometry = (model, rows, effects, patterns)
-        left, right = spread(model, rows)
-        covariance = of_anchor + product(left.mT, right) + product(effects.T, effects)
+        odometry = (effects, white, patterns)
+        covariance = of_anchor + effect_covariance(*odometry)
     variances, axes = eigh(covariance)
     sigmas = np.sqrt(np.maximum(variances, 0.0))
     inverse = axes * np.where(sigmas > LEAST_OFFSET, 1.0 / np.maximum(sigmas, LEAST_OFFSET), 0.0)

@@ -20,15 +20,7 @@ from agent.estimation.fit import Start, deviation, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.measured_rows import near_anchors
-from agent.estimation.gaussian.odometry_noise import (
-    Array,
-    Projection,
-    Ticks,
-    expected_variances,
-    spread,
-    track,
-    wander,
-)
+from agent.estimation.gaussian.odometry_noise import Array, expected_variances, position_variances, track
 from protocol.mission import Mission
 from protocol.motion import rotated
 from protocol.noise import Noise, VelocityNoise
@@ -171,15 +163,9 @@ def swept_sigma(mission: Mission, way: Sequence[Place]) -> float:
     The sigma is that of the white noise of its odometry; the median is over all ticks of the way.
     """
     v, omega = _driven(way, mission)
-    path, k = track(v, omega, mission.period), len(v)
     white = expected_variances(v, omega, mission.noise, mission.period)
-    model = wander(path, np.zeros((2, k)), np.zeros((0, 2, k)), white)
-    along_x = np.repeat((1.0, 0.0), k)
-    rows = Projection.positions(
-        path, Ticks.of(np.tile(np.arange(1, k + 1), 2), k), np.stack((along_x, 1.0 - along_x))
-    )
-    of_axes = np.sum(np.multiply(*spread(model, rows)), axis=0)
-    return float(np.median(np.sqrt(of_axes[:k] + of_axes[k:])))
+    path, constant = track(v, omega, mission.period), np.zeros((0, 2, len(v)))
+    return float(np.median(np.sqrt(position_variances(path, white, constant)[1:])))
 
 
 def _driven(way: Sequence[Place], mission: Mission) -> tuple[Array, Array]:
