@@ -84,18 +84,19 @@ def weigh_branches(
     the motion is almost radial.
     """
     ranged: list[tuple[Pose, float]] = []
-    undetected: list[Pose] = []
+    undetected: list[Positions] = []
     for pose, rho in seen:
         if rho is None:
-            undetected.append(pose)
+            undetected.append((pose.x, pose.y, 0.0, 0.0))
         else:
             ranged.append((pose, rho))
     left: list[Branch] = []
     for candidate in candidates:
         branch = polished(candidate, ranged)
+        frame = Placement(branch.start.heading, branch.start.x, branch.start.y)
         if (
             _branch_meets(branch, ranged, floor)
-            and _branch_misses(branch, undetected, sensing_range - 0.5 * margin)
+            and _explains_no_detection(frame, undetected, sensing_range - 0.5 * margin)
             and not any(math.dist(branch.anchor, other.anchor) < SAME_ANCHORS * floor for other in left)
         ):
             left.append(branch)
@@ -129,17 +130,6 @@ def _branch_meets(branch: Branch, ranged: Iterable[tuple[Pose, float]], floor: f
     for pose, rho in ranged:
         predicted = math.hypot(rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y)
         if abs(predicted - rho) * (predicted + rho) > 2.0 * floor * max(rho, rho0):
-            return False
-    return True
-
-
-def _branch_misses(branch: Branch, undetected: Iterable[Pose], reach: float) -> bool:
-    """Return whether `branch` is farther than `reach` m from the anchor at each pose of `undetected`."""
-    rho0 = branch.start.x
-    c, s = math.cos(branch.start.heading), math.sin(branch.start.heading)
-    for pose in undetected:
-        x, y = rho0 + c * pose.x - s * pose.y, s * pose.x + c * pose.y
-        if math.hypot(x, y) <= reach:
             return False
     return True
 
@@ -225,6 +215,7 @@ def _explains_ranges(placement: Placement, ranged: Iterable[tuple[Positions, flo
 
 
 def _explains_no_detection(placement: Placement, undetected: Iterable[Positions], reach: float) -> bool:
+    """Return whether a is farther than `reach` m from b, or a robot from its anchor, at all positions."""
     x, y = placement.x, placement.y
     c, s = math.cos(placement.phi), math.sin(placement.phi)
     hypot = math.hypot

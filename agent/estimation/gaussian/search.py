@@ -20,7 +20,7 @@ from agent.estimation.fit import Fit, Start, deviation, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.anchor_guesses import SEED_RANGES, UNLIKELY, anchors
 from agent.estimation.gaussian.beacon_guesses import beacon_guesses, line_of, start_of, straight
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.placement_guesses import STARTS, placements
 from agent.estimation.posterior import (
@@ -278,17 +278,14 @@ def _alone(
 ) -> JointMeasurements:
     """Return the measurements by which the robots of `candidate` are located under the hypothesis `one`."""
     measured = measured.as_surveyed
-    match candidate.robots:
-        case (robot,):
-            return among_beacons(robot, one, located, measured)
-        case (a, b):
-            own = _anchors_of_pair(a, b, measured, fewest)
-            assert own is not None
-            ranges = measured.ranges
-            mutual = np.flatnonzero((ranges.first == a) & (ranges.second == b))
-            rows = ranges.rows(np.sort(np.concatenate((*own, mutual))))
-            return replace(measured, ranges=rows, prior=None, surveyed=()).some((a, b))
-    raise AssertionError(candidate)
+    if len(candidate.robots) == 1:
+        return among_beacons(candidate.robots[0], one, located, measured)
+    (a, b), ranges = candidate.robots, measured.ranges
+    own = _anchors_of_pair(a, b, measured, fewest)
+    assert own is not None
+    mutual = np.flatnonzero((ranges.first == a) & (ranges.second == b))
+    rows = ranges.rows(np.sort(np.concatenate((*own, mutual))))
+    return replace(measured, ranges=rows, prior=None, surveyed=()).some((a, b))
 
 
 def among_beacons(
@@ -301,29 +298,19 @@ def among_beacons(
 
     The sigma of a position of a robot, at the end of its path, adds to that of each range to it.
     """
-    ranges, rows = measured.ranges, beacons(robot, located, measured)
-    place, variance = ranges.place[rows].copy(), np.square(ranges.sigma[rows])
-    other = np.where(ranges.first[rows] == robot, ranges.second[rows], ranges.first[rows])
+    ranges = measured.ranges.rows(beacons(robot, located, measured))
+    place, variance = ranges.place.copy(), np.square(ranges.sigma)
+    other = np.where(ranges.first == robot, ranges.second, ranges.first)
     for k, beacon in enumerate(located):
         own = np.flatnonzero(other == beacon)
         if one is not None and len(own):
-            place[own] = one.fit.places(k, ranges.tick[rows[own]]).T
+            place[own] = one.fit.places(k, ranges.tick[own]).T
             spread = one.fit.covariance[3 * k : 3 * k + 2, 3 * k : 3 * k + 2]
             variance[own] += min(0.5 * float(np.trace(spread)), measured.reach**2)
-    return as_anchors(robot, measured, rows, place, np.sqrt(variance))
-
-
-def as_anchors(
-    robot: int, measured: JointMeasurements, rows: Places, place: Array, sigma: Array
-) -> JointMeasurements:
-    """Return a robot alone with its ranges `rows`, as if their beacons were anchors at `place` (m)."""
-    ranges, nothing = measured.ranges, np.zeros(len(rows), np.intp)
-    own = JointRanges(
-        ranges.rho[rows], ranges.tick[rows], sigma, nothing, nothing - 1, place, ranges.radio[rows]
-    )
-    return replace(
-        measured, robots=("",), paths=(measured.paths[robot],), ranges=own, prior=None, surveyed=(), silent=()
-    )
+    first = np.zeros(len(place), np.intp)
+    ranges = replace(ranges, sigma=np.sqrt(variance), first=first, second=first - 1, place=place)
+    path = measured.paths[robot]
+    return replace(measured, robots=("",), paths=(path,), ranges=ranges, prior=None, surveyed=(), silent=())
 
 
 # --- one robot, and two --------------------------------------------------------------------------------
