@@ -38,7 +38,7 @@ from compose.cli import main as command_line
 from compose.launch import in_process
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
-from compose.recording.ranging.recording_rows import RecordingBuilder
+from compose.recording.ranging.recording_builder import RecordingBuilder
 from compose.recording.recording_files import KINDS
 from protocol.journal import journal_file
 from protocol.wire import MAX_FRAME_BYTES, decode

@@ -27,13 +27,8 @@ from compose.recording.estimating.recorded_measurements import (
 from compose.recording.estimating.recording_estimator import EstimateEpoch, RecordingEstimator
 from compose.recording.ranging.range_recording import SAME_TIME_S
 from compose.recording.ranging.range_steps import NoSteps
-from compose.recording.ranging.recording_rows import (
-    AnyRow,
-    OdometryRow,
-    PoseRow,
-    RecordingBuilder,
-    SourcePlace,
-)
+from compose.recording.ranging.recording_builder import RecordingBuilder
+from compose.recording.ranging.recording_rows import AnyRow, OdometryRow, PoseRow, SourcePlace
 
 STREAM_TICKS = 20
 """The number of ticks in an epoch of a stream. A robot of 0.5 m/s then moves by a quarter of 0.05 m in half a

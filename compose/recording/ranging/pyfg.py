@@ -17,13 +17,11 @@ import numpy as np
 
 from compose.errors import BadRecording, UserError
 from compose.recording.ranging.range_recording import Numbers, RangeRecording
+from compose.recording.ranging.recording_builder import UPPER, Covariance6, RecordingBuilder
 from compose.recording.ranging.recording_rows import (
-    UPPER,
     AnchorRow,
-    Covariance6,
     OdometryRow,
     RangeRow,
-    RecordingBuilder,
     SourcePlace,
     TruePoseRow,
     number_of,

@@ -17,13 +17,13 @@ from compose.errors import BadRecording
 from compose.extras import need
 from compose.recording.ranging.pyfg import add_pyfg
 from compose.recording.ranging.range_recording import RangeRecording
+from compose.recording.ranging.recording_builder import RecordingBuilder
 from compose.recording.ranging.recording_rows import (
     TABLES,
     AnchorRow,
     AnyRow,
     OdometryRow,
     PoseRow,
-    RecordingBuilder,
     Row,
     RowKind,
     SourcePlace,

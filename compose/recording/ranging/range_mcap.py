@@ -21,13 +21,8 @@ from mcap.records import Channel, Chunk, McapRecord, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from compose.errors import BadRecording
-from compose.recording.ranging.recording_rows import (
-    TABLES,
-    AnyRow,
-    RecordingBuilder,
-    SourcePlace,
-    wrong_field,
-)
+from compose.recording.ranging.recording_builder import RecordingBuilder
+from compose.recording.ranging.recording_rows import TABLES, AnyRow, SourcePlace, wrong_field
 from protocol import documents, files
 
 TOPICS = {f"/{name}": kind for name, kind in TABLES.items()}

@@ -18,12 +18,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from rosbags.typesys.store import Typestore
 
 from compose.errors import BadRecording, UserError
+from compose.recording.ranging.recording_builder import RecordingBuilder
 from compose.recording.ranging.recording_rows import (
     AnchorRow,
     AntennaRow,
     PoseRow,
     RangeRow,
-    RecordingBuilder,
     SourcePlace,
     StatedSigma,
     TruePoseRow,

@@ -9,14 +9,8 @@ import numpy as np
 
 from compose.errors import BadRecording
 from compose.recording.ranging.range_recording import RangeRecording
-from compose.recording.ranging.recording_rows import (
-    AnchorRow,
-    Covariance6,
-    OdometryRow,
-    RangeRow,
-    RecordingBuilder,
-    TruePoseRow,
-)
+from compose.recording.ranging.recording_builder import Covariance6, RecordingBuilder
+from compose.recording.ranging.recording_rows import AnchorRow, OdometryRow, RangeRow, TruePoseRow
 from compose.recording.run import Run
 from compose.recording.run_setup import RunSetup
 from protocol.messages import Observation
