@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
+from agent.estimation.gaussian.odometry_noise import effect_covariance, pose_effects, track, variances
 from compose.errors import BadRecording
 from compose.recording.ranging.range_recording import RangeRecording
 from compose.recording.ranging.recording_builder import Covariance6, RecordingBuilder
@@ -90,22 +91,8 @@ def increment_covariance(executed: Controls, period: float, noise: VelocityNoise
 
     ADDED_SIGMA is added, also to the sideways error, which eq. (1a) does not have by itself.
     """
-    turn = executed.omega * period
-    if abs(turn) < SMALL_TURN:
-        ahead, left = 1.0 - turn * turn / 6.0, turn / 2.0
-        ahead_by_turn, left_by_turn = -turn / 3.0, 0.5 - turn * turn / 8.0
-    else:
-        ahead, left = math.sin(turn) / turn, (1.0 - math.cos(turn)) / turn
-        ahead_by_turn, left_by_turn = (math.cos(turn) - ahead) / turn, (math.sin(turn) - left) / turn
-    by_v = np.array([ahead, left, 0.0]) * period
-    by_omega = (
-        np.array([executed.v * period * ahead_by_turn, executed.v * period * left_by_turn, 1.0]) * period
-    )
-    q_v, q_omega = noise.variances(executed.v, executed.omega)
-    matrix = q_v * np.outer(by_v, by_v) + q_omega * np.outer(by_omega, by_omega) + ADDED_SIGMA**2 * np.eye(3)
-    xx, xy, xh, yy, yh, hh = [float(value) for value in matrix[np.triu_indices(3)]]
+    v, omega, no_constants = np.array([executed.v]), np.array([executed.omega]), np.zeros((0, 2, 1))
+    effects = pose_effects(track(v, omega, period), 0, 1)
+    matrix = effect_covariance(effects, variances(v, omega, noise), no_constants) + ADDED_SIGMA**2 * np.eye(3)
+    xx, xy, xh, yy, yh, hh = matrix[np.triu_indices(3)].tolist()
     return (xx, xy, xh, yy, yh, hh)
-
-
-SMALL_TURN = 1e-4
-"""The turn in rad below which series are used."""
