@@ -21,7 +21,7 @@ from agent.estimation.gaussian.anchor_guesses import (
     _couples,
     _odometry_variance,
 )
-from agent.estimation.gaussian.detections import CLEAR, EDGE, SILENT
+from agent.estimation.gaussian.evidence import CLEAR, EDGE, SILENT
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, Silence
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.placement_guesses import (

@@ -23,8 +23,7 @@ from agent.estimation.gaussian import claim_rivals, evidence, placement_guesses
 from agent.estimation.gaussian import search as searching
 from agent.estimation.gaussian.anchor_guesses import anchors
 from agent.estimation.gaussian.consistency import FINISHED, consistency_test
-from agent.estimation.gaussian.detections import SILENT, detection_log_likelihoods
-from agent.estimation.gaussian.evidence import anchor_evidence
+from agent.estimation.gaussian.evidence import SILENT, anchor_evidence, detection_log_likelihoods
 from agent.estimation.gaussian.joint_ranges import (
     MOST_CORRELATED_RANGES,
     MOST_MUTUAL_RANGES,

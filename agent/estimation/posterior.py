@@ -17,7 +17,7 @@ from agent.estimation.compiled import address, library
 from agent.estimation.fit import TO_THE_END, Fit, Start, fits
 from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.consistency import FINISHED
-from agent.estimation.gaussian.detections import detection_log_likelihoods
+from agent.estimation.gaussian.evidence import detection_log_likelihoods
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import misfit_log_likelihood
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import PairObservation, information
-from agent.estimation.mutual_ranges import ELSEWHERE
+from agent.estimation.exact_estimator import ELSEWHERE
 from agent.planning.planner import Manoeuvres
 from agent.planning.separation import nearest
 from protocol.mission import RANGE_MARGIN, Mission, Role

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from itertools import combinations
 from typing import Any
 
+from agent.estimation.exact_estimator import ELSEWHERE
 from agent.estimation.judged import sufficient_mutual_ranges
-from agent.estimation.mutual_ranges import ELSEWHERE
 from agent.planning.planner import Planner
 from agent.planning.separation import LARGEST_ERROR_SIGMAS
 from agent.process.agent_journal import AgentHistory
