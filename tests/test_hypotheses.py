@@ -22,6 +22,7 @@ from agent.estimation.gauss_newton import Convergence, Fitted
 from agent.estimation.gaussian import claim_rivals, evidence, placement_guesses
 from agent.estimation.gaussian import search as searching
 from agent.estimation.gaussian.anchor_guesses import anchors
+from agent.estimation.gaussian.beacon_guesses import start_of
 from agent.estimation.gaussian.consistency import FINISHED, consistency_test
 from agent.estimation.gaussian.evidence import SILENT, anchor_evidence, detection_log_likelihoods
 from agent.estimation.gaussian.joint_ranges import (
@@ -35,7 +36,7 @@ from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, constant_errors, track
 from agent.estimation.gaussian.placement_guesses import _encounter, placements
 from agent.estimation.gaussian.planning_hypotheses import planning_hypothesis
-from agent.estimation.gaussian.search import _until_now, of_anchor, search, starts_about
+from agent.estimation.gaussian.search import _until_now, of_anchor, search
 from agent.estimation.kernel import Kernel
 from agent.estimation.posterior import NO_HYPOTHESES, Hypothesis, Posterior, follow
 from agent.estimation.smoother import Singular
@@ -328,7 +329,7 @@ def test_compiled_guesses_are_those_of_their_text_to_the_bit(
             assert np.array_equal(guesses, anchors_by_numpy(own))
             again = anchors(own, guesses.tolist())
             assert np.array_equal(again, anchors_by_numpy(own, guesses.tolist()))
-        found = [fits(own, starts_about(anchors(own)[:1])) for own in alone]
+        found = [fits(own, map(start_of, anchors(own)[:1])) for own in alone]
         if not all(found) or not pair.ranges.mutual.any():
             continue
         tried += 1
@@ -363,7 +364,7 @@ def test_a_fit_begins_on_a_path_that_is_off_by_what_its_placement_assumes(seed: 
     """The offset at the encounter is due to the anchor, and to the odometry since the last range to it."""
     pair, truth = after_a_long_way(seed)
     base = 20
-    (own,) = fits(pair.alone(0), starts_about([truth[:2]]))
+    (own,) = fits(pair.alone(0), [start_of(truth[:2])])
     robot = _encounter(own, base, (base,))
     anchor, (errors,) = robot.begun(own, np.array(z))
     driven = pair.paths[0]

@@ -11,6 +11,7 @@ from msgspec.structs import replace
 from scipy import stats  # type: ignore[import-untyped]
 
 from agent.estimation.fit import Fit, fits
+from agent.estimation.gaussian.beacon_guesses import start_of
 from agent.estimation.gaussian.consistency import beta_binomial_tail, f_tail, fisher, sigmas
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import LEAST_LEVEL, noise_level, residual_correlation
@@ -23,7 +24,6 @@ from agent.estimation.gaussian.own_sensors import doubt
 from agent.estimation.gaussian.range_model import inlier_probability
 from agent.estimation.gaussian.range_weights import Weighing, weights_by_errors
 from agent.estimation.gaussian.reachable_accuracy import reference_sigma
-from agent.estimation.gaussian.search import starts_about
 from agent.peer.peer_state import PeerState
 from agent.planning.assured import Assured
 from agent.planning.plausibility import objection
@@ -123,7 +123,7 @@ def test_the_profile_of_uncalibrated_radios_needs_a_coarser_accuracy_than_a_tent
 
 def fitted(path: Track, rho: Array, noise: Noise, anchor: Array) -> Fit:
     """Return the fit to a range in each tick that begins with the anchor at `anchor` (m)."""
-    (found,) = fits(alone(path, rho.tolist(), noise), starts_about([anchor]))
+    (found,) = fits(alone(path, rho.tolist(), noise), [start_of(anchor)])
     return found
 
 

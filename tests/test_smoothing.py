@@ -18,6 +18,7 @@ from agent.estimation import smoother
 from agent.estimation.fit import Fit, Start, deviation, fits, held_fits
 from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
 from agent.estimation.gaussian import joint_ranges
+from agent.estimation.gaussian.beacon_guesses import start_of
 from agent.estimation.gaussian.claim_rivals import FAR_ANCHOR, _holding
 from agent.estimation.gaussian.consistency import FINISHED
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -30,7 +31,6 @@ from agent.estimation.gaussian.odometry_noise import (
     track,
 )
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
-from agent.estimation.gaussian.search import starts_about
 from agent.estimation.problem import MOST_MEASURED_LENGTHS, Problem
 from protocol.motion import ORIGIN, Pose, rotated, step
 from protocol.noise import Noise, VelocityNoise
@@ -308,8 +308,8 @@ def test_a_fit_that_begins_where_one_ended_ends_there_too() -> None:
     told = (20.0 - driven.x).tolist()
     noise = Noise(0.01, odometry=VelocityNoise(v=0.05)).as_told
     own = alone(measured, told, noise)
-    (first,) = fits(own, starts_about([np.array((20.0, 0.0))]))
-    (again,) = fits(own, starts_about([first.guess[:2]]))
+    (first,) = fits(own, [start_of(np.array((20.0, 0.0)))])
+    (again,) = fits(own, [start_of(first.guess[:2])])
     assert again.guess == pytest.approx(first.guess, abs=1e-9)
     assert again.poses[0, 0] == pytest.approx(first.poses[0, 0], abs=1e-9)
     assert first.poses[0, 0] == pytest.approx(driven.x[-1] - 20.0, abs=0.01)
@@ -424,7 +424,7 @@ def test_exact_ranges_and_strides_of_a_kilometre_leave_a_covariance_that_can_be_
     path = track(np.array([1e3, -1e3, 1e3, 0.0, 0.0]), np.array([0.3, -0.2, 0.4, 0.0, 0.0]), 1.0)
     anchor, noise = np.array((400.0, 300.0)), Noise(odometry=VelocityNoise(0.01, 0.01)).as_told
     rho = np.hypot(path.x - anchor[0], path.y - anchor[1])
-    (found,) = fits(alone(path, rho.tolist(), noise), starts_about([anchor + (1.0, -1.0)]))
+    (found,) = fits(alone(path, rho.tolist(), noise), [start_of(anchor + (1.0, -1.0))])
     assert found.guess == pytest.approx([*anchor, 0.0], abs=1e-3)
     assert np.min(np.linalg.eigvalsh(found.of_start[:2, :2])) > 0.0
     assert found.last_step < LAST_STEP
@@ -474,7 +474,7 @@ def test_the_heading_of_a_robot_alone_is_held_and_its_evidence_does_not_depend_o
     for held in (1e22, 1e26):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(joint_ranges, "HELD", held)
-            (found,) = fits(one.pair.alone(0), starts_about([nudged(one, seed, 0.05)[:2]]))
+            (found,) = fits(one.pair.alone(0), [start_of(nudged(one, seed, 0.05)[:2])])
         assert abs(found.start.poses[0, 2]) < 1e-15
         weights.append(found.weight)
         starts.append(found.guess)

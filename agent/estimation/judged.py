@@ -93,8 +93,6 @@ class Judged(NamedTuple):
     """The fit of the most probable hypothesis."""
     measured: JointMeasurements
     """The measurements to which it is the fit."""
-    origin: tuple[float, float]
-    """The point of <W> (m) to which the poses of the fit are relative."""
     hypotheses: int
     """The number of hypotheses that differ in this robot's pose."""
     ranges: int
@@ -140,7 +138,7 @@ class Judged(NamedTuple):
     @property
     def localised(self) -> Localised:
         """The pose and its covariance in <W>; with exact sensors, without one."""
-        found = localised(self.stated, self.robot, self.origin)
+        found = localised(self.stated, self.robot, self.measured.origin)
         return Localised(found.pose) if self.measured.only_rounding else found
 
 
@@ -167,7 +165,6 @@ def of_pair(
         robot=robot,
         fit=best.fit,
         measured=pair,
-        origin=(config.m1.x, config.m1.y),
         hypotheses=len(scored),
         ranges=places,
         required=required,
@@ -213,7 +210,6 @@ def of_joint(
         robot=robot,
         fit=fit,
         measured=measured,
-        origin=measured.origin,
         hypotheses=certainty.poses,
         ranges=decisive_ranges(robot, measured),
         required=sufficient_mutual_ranges(measured.noise),

@@ -85,8 +85,11 @@ def beacon_guesses(robot: JointMeasurements) -> list[Array]:
 
 
 def start_of(guess: Array) -> Start:
-    """Return the pose of a robot at tick 0 from a guess, (3,), in the layout of `predicted`."""
-    mx, my, turn = guess.tolist()
+    """Return the pose of a robot at tick 0 from a guess, (3,), in the layout of `predicted`.
+
+    A guess for an anchor in the frame of the odometry, (2,), has no rotation.
+    """
+    mx, my, turn = (*guess.tolist(), 0.0)[:3]
     x, y = rotated(math.cos(turn), math.sin(turn), mx, my)
     return Start(np.array([[-x, -y, turn]]))
 

@@ -22,12 +22,12 @@ from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, PosePrior
 from agent.estimation.gaussian.measured_rows import Listed, near_anchors
 from agent.estimation.gaussian.odometry_noise import Track
-from agent.estimation.gaussian.planning_hypotheses import covariance_of
+from agent.estimation.gaussian.planning_hypotheses import localised, planning_hypothesis
 from agent.estimation.gaussian.search import extended
 from agent.estimation.judged import of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, certainties, follow
 from protocol.mission import Mission
-from protocol.motion import Covariance, Pose, wrap
+from protocol.motion import Covariance, Pose
 
 FINDER, OWN = 0, 1
 """The places of the two robots in a fit."""
@@ -97,15 +97,15 @@ def _is_sendable(estimate: ContactEstimate) -> bool:
 
 def _estimate(found: Posterior, measured: JointMeasurements, mission: Mission) -> ContactEstimate:
     best, certainty = found.hypotheses[0].fit, certainties(found)[OWN]
-    mine = slice(3 * OWN, 3 * OWN + 3)
-    poses = [one.fit.poses[OWN].tolist() for one in found.hypotheses]
+    claims = [localised(planning_hypothesis(one), OWN, measured.origin) for one in found.hypotheses]
+    assert claims[0].covariance is not None
     blocking = blocked(
         of_joint("unanchored", OWN, found, certainty, measured, mission.accuracy, mission.confidence)
     )
     return ContactEstimate(
-        tuple([Pose(measured.origin[0] + x, measured.origin[1] + y, wrap(turn)) for x, y, turn in poses]),
+        tuple([one.pose for one in claims]),
         tuple([one.probability for one in found.hypotheses]),
-        covariance_of(best.covariance[mine, mine]),
+        claims[0].covariance,
         blocking.reason if blocking is not None else "",
         chi2_p_value(best.chi2, best.freedom),
     )

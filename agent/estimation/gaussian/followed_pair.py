@@ -81,10 +81,9 @@ def believed(
     The claim is that of `user`, and the last is the first of the `conditions` that is not met.
     """
     config, scored = knowledge.config, found.hypotheses
-    robot, m1 = 0 if config.role == "a" else 1, config.m1
+    robot, m2 = 0 if config.role == "a" else 1, m2_of(config)
     claims = [
-        localised(to_second_order(one, m2_of(config)), robot, (m1.x, m1.y))
-        for one in map(planning_hypothesis, scored)
+        localised(to_second_order(planning_hypothesis(one), m2), robot, measured.origin) for one in scored
     ]
     judged = of_pair(user, config, scored, measured)
     if judged is not None and user == "assured" and not isinstance(knowledge.peer_state.verdict, Localised):
@@ -122,8 +121,7 @@ def _searched(
         failures = attempt.inconsistent_searches + 1 if judged.rejected else 0
         attempt = replace(attempt, inconsistent_searches=failures, p_value=least)
         if failures >= INCONSISTENT_SEARCHES:
-            own = own_measurements(knowledge).thinned_after()
-            doubted = doubt(own, measured, judged.robot)
+            doubted = doubt(own_measurements(knowledge), measured, judged.robot)
             verdict = test if doubted is None else Undecided(doubted.reason())
     match blocking:
         case _ if judged is None or verdict is not None:

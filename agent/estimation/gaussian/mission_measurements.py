@@ -112,7 +112,7 @@ def own_measurements(knowledge: Knowledge) -> JointMeasurements:
         *([ranges], [(0.0, 0.0)], mission.noise, mission.sensing_range),
         silent=(Silence(0, -1, silent),),
     )
-    return replace(own.alone(0), solver=knowledge.solver)
+    return replace(own.alone(0), solver=knowledge.solver).thinned(mission.sensing_range)
 
 
 def pair_of(knowledge: Knowledge) -> JointMeasurements:
@@ -134,7 +134,8 @@ def pair_of(knowledge: Knowledge) -> JointMeasurements:
         *((of_a, of_b), ((0.0, 0.0), m2_of(config)), mission.noise, mission.sensing_range, mutual),
         silent=(Silence(0, -1, a_silent), Silence(1, -1, b_silent), Silence(0, 1, both_silent)),
     )
-    return replace(measured.thinned(mission.sensing_range), solver=knowledge.solver)
+    measured = replace(measured, origin=(config.m1.x, config.m1.y), solver=knowledge.solver)
+    return measured.thinned(mission.sensing_range)
 
 
 def m2_of(config: RobotConfig) -> tuple[float, float]:

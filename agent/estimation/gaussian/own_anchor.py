@@ -22,7 +22,6 @@ from protocol.motion import Pose, compose, inverse, relative, wrap
 def followed(knowledge: Knowledge) -> OwnAnchor | None:
     """Return what the ranges to the anchor say, with hypotheses; None if there is none."""
     own = own_measurements(knowledge)
-    own = own.thinned(own.reach)
     scored = of_anchor(knowledge.own_anchor.hypotheses, own) if len(own.ranges.rho) else ()
     if not scored:
         return None
@@ -89,8 +88,7 @@ def is_anchor_known(knowledge: Knowledge) -> bool:
         return False
     if mission.noise.outliers or good >= ANCHOR_RANGES:
         return good >= (ANCHOR_RANGES_WITH_OUTLIERS if mission.noise.outliers else ANCHOR_RANGES)
-    own = own_measurements(knowledge)
-    return anchor_evidence(best.fit, own.thinned(own.reach)) >= ANCHOR_EVIDENCE
+    return anchor_evidence(best.fit, own_measurements(knowledge)) >= ANCHOR_EVIDENCE
 
 
 def _anchor_sigma(fit: Fit) -> float:

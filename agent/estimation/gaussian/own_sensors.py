@@ -15,10 +15,11 @@ from msgspec.structs import replace
 from agent.estimation.fit import Fit, Start, fits
 from agent.estimation.gauss_newton import FIT_STEPS, Convergence
 from agent.estimation.gaussian.anchor_guesses import anchors
+from agent.estimation.gaussian.beacon_guesses import start_of
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, consistency_test
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import rescaled
-from agent.estimation.gaussian.search import search, starts_about
+from agent.estimation.gaussian.search import search
 from protocol.noise import PROFILES, SIZES, UNTOLD_SIGMA, Noise, ProfileName
 
 DOUBTED_EVIDENCE = 3.0
@@ -178,5 +179,5 @@ def _profile(name: ProfileName, noise: Noise, share: float = 1.0) -> Noise:
 
 def _log_evidence(own: JointMeasurements) -> float:
     """Return the log evidence of the ranges to the anchor, with its position integrated out."""
-    found = fits(own, starts_about(anchors(own)))
+    found = fits(own, map(start_of, anchors(own)))
     return max([one.weight for one in found], default=-math.inf)

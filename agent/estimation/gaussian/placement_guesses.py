@@ -49,7 +49,10 @@ A fit moves by itself along directions that the ranges leave undetermined.
 """
 
 OFFSETS = (0.0, 1.0, -1.0, 2.0, -2.0)
-"""The offsets of the far robot from its anchor's circle that are scanned, in sigmas of its radius."""
+"""The offsets of the far robot from its anchor's circle that are scanned, in sigmas of its radius.
+
+With 0 alone, sweeps have the same results, and half as many of those pairs again are missed (`Encounter`).
+"""
 
 WIDE = 0.25
 """The sigma of that radius, in steps of the scan, from which on other offsets than 0 are scanned.
@@ -104,7 +107,11 @@ class Encounter(NamedTuple):
     of their white errors, (2, k), and their constant errors since then, (m, 2, k); None if it is exact."""
 
     def begun(self, own: Fit, z: Array) -> tuple[Array, tuple[Errors, ...]]:
-        """Return the anchor (m) and the odometry errors for the whitened offset `z`, shape (3,)."""
+        """Return the anchor (m) and the odometry errors for the whitened offset `z`, shape (3,).
+
+        Sweeps have the same results if fits begin without them. But of 1 524 pairs of which a had driven 30 m
+        with a wandering gyro, and without any range, the search missed the truth of 26, and not of 11.
+        """
         weights = product(self.inverse, z[:, None])[:, 0]
         anchor = own.guess[:2] - product(self.of_anchor[:2], weights[:, None])[:, 0]
         if self.odometry is None:

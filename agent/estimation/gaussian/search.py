@@ -367,7 +367,7 @@ def _up_to_last_range(own: JointMeasurements) -> tuple[Hypothesis, ...]:
 
     A robot that has left its anchor has the same in each tick.
     """
-    return hypotheses_of(fits(own, starts_about(anchors(own))), own)
+    return hypotheses_of(fits(own, map(start_of, anchors(own))), own)
 
 
 def of_anchor(before: Iterable[Hypothesis], own: JointMeasurements) -> tuple[Hypothesis, ...]:
@@ -381,10 +381,5 @@ def of_anchor(before: Iterable[Hypothesis], own: JointMeasurements) -> tuple[Hyp
     if known and len(own.ranges.rho) > enough and not lost:
         warm = Convergence(WARM_STEPS, COARSE_STILL, WARM_DECREASE)
         return hypotheses_of(fits(own, known, warm), own)
-    starts = starts_about(anchors(own, [(-one.poses[0, :2]).tolist() for one in known]))
+    starts = map(start_of, anchors(own, [(-one.poses[0, :2]).tolist() for one in known]))
     return hypotheses_of(fits(own, starts, Convergence(shortest=COARSE_STILL)), own)
-
-
-def starts_about(points: Iterable[Array]) -> list[Start]:
-    """Return starts of one robot, whose anchor is the origin and at `points` (m) in its own frame."""
-    return [Start(np.array([[-x, -y, 0.0]])) for x, y in points]
