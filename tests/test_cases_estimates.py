@@ -245,7 +245,7 @@ def test_a_recording_that_contradicts_itself_is_searched_a_bounded_number_of_tim
     monkeypatch.setattr(following, "MOST_SEARCHES", 5)
     found = estimated(measurements(with_ranges(recording, shuffled), None, "uwb", (0.0, 16.0)), ClaimRule())
     assert not any(row.claim for row in found.rows)
-    assert len(searched) <= 5 + len(following.GROUP_SEARCHES)
+    assert len(searched) <= 5 + len(following.SEARCHED_AT)
 
 
 # --- all anchors ------------------------------------------------------------------------------------------

@@ -1,6 +1,6 @@
 """The estimate of any number of robots that goes on from tick to tick: of a team, or of a recording.
 
-Robots that are located are followed. The whole plane is searched at the numbers of ranges GROUP_SEARCHES, and
+Robots that are located are followed. The whole plane is searched at the numbers of ranges SEARCHED_AT, and
 before the first claim of each robot.
 """
 
@@ -33,8 +33,12 @@ from agent.estimation.gaussian.search import (
 from agent.estimation.judged import Judged, User, misfit, of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, carried, certainties, ended, settled
 
-GROUP_SEARCHES = tuple(8 * 2**n for n in range(16))
-"""The numbers of ranges at which the whole plane is searched again."""
+SEARCHED_AT = tuple(8 * 2**n for n in range(16))
+"""The numbers of ranges, of a pair of mutual ones, at which the whole plane is searched again.
+
+They only bound how long a missed hypothesis stays missed: the plane is also searched before each first claim.
+More searches cost time; with fewer, robots plan with too few hypotheses.
+"""
 
 MOST_SEARCHES = 100
 """The number of searches of the whole plane after which it is only searched with twice as many ranges.
@@ -131,7 +135,7 @@ class Following(NamedTuple):
         known = carried(self.known, self.part, used) if self.part is not None else self.known
         known = ended(settled(known, used), used)
         now = self._extended(known if known.hypotheses else begun(used), used)
-        due = now.known.hypotheses and any(self.searched < at <= count for at in GROUP_SEARCHES)
+        due = now.known.hypotheses and any(self.searched < at <= count for at in SEARCHED_AT)
         now = now._tested(used, rule, user, asked)
         claiming = now._claiming - self.claimed
         if claiming and not due and self.searches >= MOST_SEARCHES:

@@ -9,6 +9,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.claim import BEFORE_SEARCH, CONDITIONS, Blocked, Condition, blocked, profiles, rivals
+from agent.estimation.following import SEARCHED_AT
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import beginning, m2_of, own_measurements, pair_of
@@ -25,14 +26,6 @@ from agent.estimation.knowledge import Attempt, Belief, Knowledge
 from agent.estimation.posterior import PAIR, Posterior, settled
 from protocol.messages import Localised, Undecided, Verdict
 
-PAIR_SEARCHES = frozenset((FEWEST_FOR_CLAIM, *(8 * 2**n for n in range(12))))
-"""The numbers of mutual ranges at which the whole plane is searched again for hypotheses.
-
-They only bound how long a missed hypothesis stays missed: the plane is also searched before each claim, and
-where the best fit does not converge. More searches cost time; with fewer, robots plan with too few
-hypotheses.
-"""
-
 
 class FollowedPair(NamedTuple):
     """The estimate of a pair in one tick."""
@@ -48,7 +41,7 @@ class FollowedPair(NamedTuple):
 def followed(knowledge: Knowledge) -> FollowedPair:
     """Return the estimate of both robots, by the hypotheses of the last tick or by a search.
 
-    The whole plane is searched if nothing is known, at the counts PAIR_SEARCHES, if the best fit does not
+    The whole plane is searched if nothing is known, at the counts SEARCHED_AT, if the best fit does not
     converge, and before a claim or a suspicion.
     """
     first = beginning(knowledge, knowledge.known_through)
@@ -60,7 +53,7 @@ def followed(knowledge: Knowledge) -> FollowedPair:
     if mutual < FEWEST_FOR_CLAIM:
         return FollowedPair(measured, belief)
     known = settled(Posterior(PAIR, belief.pair), measured)
-    due = any(belief.attempt.ranges_at_last_search < count <= mutual for count in PAIR_SEARCHES)
+    due = any(belief.attempt.ranges_at_last_search < at <= mutual for at in SEARCHED_AT)
     if known.hypotheses and known.has_converged and not due:
         belief, judged, blocking = believed(knowledge, "assured", known, measured, BEFORE_SEARCH)
         test = judged and judged.inconsistency
