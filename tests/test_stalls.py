@@ -69,12 +69,12 @@ def test_a_stalled_robot_moves_to_where_its_next_range_differs() -> None:
 def test_a_stalled_pair_does_not_stand_still() -> None:
     """The poses are those of a mission in which both stood still for 130 ticks."""
     known = np.diag([0.05**2, 0.05**2, 0.05**2] * 2)
-    mirrored = [
+    mirrored = (
         held(0.26, [9.63, -1.30, -0.13, 9.97, -0.06, -2.03], known),
         held(0.26, [9.66, -1.19, -0.11, 9.97, 0.06, 2.04], known),
         held(0.24, [9.62, 1.31, 0.15, 9.98, 0.07, 1.89], known),
         held(0.24, [9.65, 1.18, 0.13, 9.98, -0.07, -1.88], known),
-    ]
+    )
     assert plan_together(mirrored, (10.0, 0.0), 1.3, MISSION) == (REST, REST)
     _, b = plan_together(mirrored, (10.0, 0.0), 1.3, MISSION, objective=STALLED)
     assert b != REST
@@ -83,7 +83,7 @@ def test_a_stalled_pair_does_not_stand_still() -> None:
 @pytest.mark.parametrize("resting", ["a", "b"])
 def test_beside_a_peer_that_has_claimed_only_the_other_robot_moves(resting: Role) -> None:
     known = np.diag([0.05**2, 0.05**2, 0.05**2] * 2)
-    hypotheses = [held(1.0, [9.6, -1.0, 0.0, 10.0, -0.3, 2.0], known)]
+    hypotheses = (held(1.0, [9.6, -1.0, 0.0, 10.0, -0.3, 2.0], known),)
     plan = plan_together(hypotheses, (10.0, 0.0), 1.0, MISSION, objective=STALLED, resting=resting)
     at_rest, mover = (plan[0], plan[1]) if resting == "a" else (plan[1], plan[0])
     assert at_rest == REST

@@ -17,8 +17,7 @@ from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Belief
 from agent.estimation.posterior import Posterior
 from agent.planning.assured import Assured
-from agent.planning.phase2_orbit import orientation
-from agent.planning.phase2_pursuit import OFF_RADIUS
+from agent.planning.phase2_orbit import OFF_RADIUS, orientation
 from agent.planning.state import RobotState
 from agent.planning.tasks import Aligning, Radial
 from compose.launch.in_process import run_mission

@@ -115,7 +115,7 @@ def test_together_robots_keep_in_range_and_apart(
     b = Pose(M2[0] + off * REACH * math.cos(bearing), off * REACH * math.sin(bearing), b_heading)
     a = Pose(b.x + between * REACH * math.cos(towards), b.y + between * REACH * math.sin(towards), heading)
     poses = np.array([a.x, a.y, a.heading, b.x, b.y, b.heading])
-    by_a, by_b = plan_together([PlanningHypothesis(1.0, poses, BOTH_SETTLED)], M2, between * REACH, MISSION)
+    by_a, by_b = plan_together((PlanningHypothesis(1.0, poses, BOTH_SETTLED),), M2, between * REACH, MISSION)
     there, peer = after(a, by_a), after(b, by_b)
     assert 0.15 * REACH < math.hypot(there.x - peer.x, there.y - peer.y) < 0.95 * REACH
     assert math.hypot(peer.x - M2[0], peer.y - M2[1]) < 0.95 * REACH

@@ -115,8 +115,9 @@ def plan_alone(
     return ways.controls(int(np.argmin(cost)))
 
 
+@lru_cache(maxsize=2)  # both robots of one process ask for it
 def plan_together(
-    hypotheses: Sequence[PlanningHypothesis],
+    hypotheses: tuple[PlanningHypothesis, ...],
     m2: tuple[float, float],
     rho: float,
     mission: Mission,
@@ -133,19 +134,6 @@ def plan_together(
     stands still: only the manoeuvre of the other one is selected. The `standing_cost` of the objective counts
     for b; for a only if b is resting.
     """
-    return _planned_together(tuple(hypotheses), m2, rho, mission, objective, resting)
-
-
-@lru_cache(maxsize=2)
-def _planned_together(
-    hypotheses: tuple[PlanningHypothesis, ...],
-    m2: tuple[float, float],
-    rho: float,
-    mission: Mission,
-    objective: Objective,
-    resting: Role | None,
-) -> tuple[Controls, Controls]:
-    """Return the manoeuvres of `plan_together`, which both robots of one process ask for."""
     ways = choice(mission, objective.strides)
     stand = len(ways.v) - 1
     still, every = np.array([stand]), np.arange(stand + 1)

@@ -156,7 +156,7 @@ def _aligned(state: RobotState) -> RobotState:
     """Return `state` on the way to its orbit or waiting place; a planner of the user drives there itself."""
     if state.agenda.own is not None:
         return state
-    return phase2_orbit.begun(state)
+    return phase2_orbit.continued(state)
 
 
 def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotState:

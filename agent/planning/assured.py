@@ -2,7 +2,7 @@
 
 With exact sensors, it follows the paper's phases with more manoeuvres to choose from, until one placement is
 left and a redundant range has confirmed it. With noisy sensors, it measures until the poses are as accurate
-as the mission asks, in the phases of the paper (`phase1_survey`, `phase2_pursuit`, `phase3_survey`).
+as the mission asks, in the phases of the paper (`phase1_survey`, `phase2_orbit`, `phase3_survey`).
 """
 
 from __future__ import annotations
@@ -16,13 +16,11 @@ from agent.planning import (
     phase1_anchor,
     phase1_survey,
     phase2_orbit,
-    phase2_pursuit,
     phase3_survey,
     phase3_turns,
     plausibility,
     tasks,
 )
-from agent.planning.drive import controls
 from agent.planning.exchange import LogPlanner, Steps
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.planner import Manoeuvres
@@ -45,7 +43,7 @@ class Assured(LogPlanner):
     )
     """The paper's steps, with more manoeuvres to choose from."""
     CORRECTED = Steps(
-        phase1_survey.unranged, phase1_survey.continued, phase2_pursuit.continued, phase3_survey.decided
+        phase1_survey.unranged, phase1_survey.continued, phase2_orbit.surveyed, phase3_survey.decided
     )
     ACTIVE_SENSING = True
 
@@ -67,7 +65,7 @@ class Assured(LogPlanner):
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return exchange.command(state, REST if self._must_wait(state) else controls(state))
+        return exchange.command(state, REST) if _must_wait(state) else super().command(state)
 
     def joint_manoeuvres(
         self,
@@ -83,26 +81,16 @@ class Assured(LogPlanner):
         robots compute both from the same measurements. It is not asked while they are stalled (see
         `strides`), nor when one of them has claimed its pose.
         """
-        return active_sensing.plan_together(hypotheses, m2, rho, mission)
+        return active_sensing.plan_together(tuple(hypotheses), m2, rho, mission)
 
-    def _must_wait(self, state: RobotState) -> bool:
-        """Return whether the robot stands still, in range of a peer with which phase 3 cannot begin yet.
 
-        The peer is then in phase 1, or none of its reports has been received, or it is b and too near its
-        anchor.
-        """
-        return (
-            state.in_contact
-            and (state.peer_state.start is None or state.config.role == "a")
-            and isinstance(state.task, tasks.Orbital | tasks.Travelling)
-        )
+def _must_wait(state: RobotState) -> bool:
+    """Return whether the robot stands still, in range of a peer with which phase 3 cannot begin yet.
 
-    def _sense(self, state: RobotState, ranged: bool) -> RobotState:
-        """Continue active sensing, or the search for the anchor: only under noise."""
-        match state.task:
-            case tasks.Surveying("anchor") | tasks.Homing() as task:
-                return phase1_survey.sensed(state, task, ranged)
-            case tasks.Surveying() | tasks.Listening() | tasks.Retreating() as task:
-                return phase3_survey.sensed(state, task)
-            case _:
-                return state
+    The peer is then in phase 1, or none of its reports has been received, or it is b and too near its anchor.
+    """
+    return (
+        state.in_contact
+        and (state.peer_state.start is None or state.config.role == "a")
+        and isinstance(state.task, tasks.Orbital | tasks.Travelling)
+    )

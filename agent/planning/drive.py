@@ -5,10 +5,11 @@ from __future__ import annotations
 import math
 
 from agent.planning import tasks
-from agent.planning.range_seeking import inside_arc, step_length
+from agent.planning.separation import leeway
 from agent.planning.state import RobotState
+from agent.planning.tasks import Beacon
 from protocol.mission import Mission
-from protocol.motion import REST, Controls, Pose, relative, travelled, wrap
+from protocol.motion import REST, TAU, Controls, Pose, relative, travelled, wrap
 from protocol.orbits import Orbit
 from protocol.sweep_strips import Place
 from protocol.sweep_ticks import sweep_speed
@@ -28,7 +29,7 @@ def controls(state: RobotState) -> Controls:
     task, odometry, mission = state.task, state.odometry, state.config.mission
     match task:
         case tasks.Orbiting():
-            return task.command or state.orbit.controls
+            return task.command or state.config.orbit.controls
         case tasks.Aligning(heading) | tasks.Tangent(heading) | tasks.Turning(heading=heading):
             return turn(odometry, heading, mission)
         case tasks.Radial():
@@ -61,10 +62,30 @@ def controls(state: RobotState) -> Controls:
             return REST
 
 
+def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:
+    """Return the length in m of the straight from a point with range `rho0` in m to `beacon`.
+
+    The length is A_0, or less to keep a safety distance from the peer.
+    """
+    step = mission.first_straight
+    return step if beacon == "anchor" else min(step, leeway(rho0, mission))
+
+
+def inside_arc(rho0: float, radius: float, reach: float) -> float:
+    """Return 2 pi - 2 eta in rad (Section III.A.2): the part of a circle that is in range of the beacon.
+
+    The circle has the radius `radius` and its centre is `rho0` from the beacon, whose range is `reach`; all
+    in m.
+    """
+    rho0 = min(rho0, reach)  # an outlier may be longer than R
+    cosine = (reach * reach - rho0 * rho0 - radius * radius) / (2.0 * radius * rho0) if rho0 > 0.0 else 1.0
+    return TAU - 2.0 * math.acos(min(1.0, max(-1.0, cosine)))
+
+
 def left_to_orbit(state: RobotState) -> float:
     """Return the distance in m from the robot outward to its orbit; negative outside the orbit."""
     local = state.local_pose
-    return state.orbit.radius - math.hypot(local.x, local.y)
+    return state.config.orbit.radius - math.hypot(local.x, local.y)
 
 
 def homing(place: Pose, pose: Pose, mission: Mission, tolerance: float) -> Controls | None:

@@ -13,8 +13,11 @@ from agent.estimation.solver import Solver
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import (
+    drive,
     phase1_anchor,
+    phase1_survey,
     phase3_last_manoeuvre,
+    phase3_survey,
     phase3_turns,
     range_seeking,
     separation,
@@ -151,7 +154,7 @@ class Steps(NamedTuple):
 
 
 class LogPlanner(Planner[RobotState, Report]):
-    """A planner with the state of the shipped planners. Subclasses define `decide` and `command`."""
+    """A planner with the state of the shipped planners. Subclasses define `decide`."""
 
     BODY = Report
     MANOEUVRES: Manoeuvres
@@ -176,33 +179,35 @@ class LogPlanner(Planner[RobotState, Report]):
                 return state
             case tasks.Orbital():
                 return self._steps(state).phase2(state, task, ranged)
-            case tasks.Searching(beacon):
-                measured = state.in_contact if beacon == "peer" else ranged
-                seeking = range_seeking.onward(state, task, measured, self.MANOEUVRES)
-                if seeking is not None:
-                    return state.doing(seeking)
-                if beacon == "peer":
-                    return state.doing(tasks.Waiting())
-                return self._steps(state).phase1(state, self.MANOEUVRES)
+            case tasks.Searching("peer"):
+                seeking = range_seeking.onward(state, task, state.in_contact, self.MANOEUVRES)
+                return state.doing(seeking or tasks.Waiting())
+            case tasks.Searching():
+                seeking = range_seeking.onward(state, task, ranged, self.MANOEUVRES)
+                return state.doing(seeking) if seeking else self._steps(state).phase1(state, self.MANOEUVRES)
             case tasks.ThirdPoint(_, origin) if state.odometry != origin:
                 return self._steps(state).phase1(state, self.MANOEUVRES)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
                 return phase3_turns.after_last_manoeuvre(state, task)
-            case tasks.Asleep() if observation.anchor_range is not None:
-                return phase1_anchor.begun(state, observation.anchor_range)
             case tasks.Asleep():
-                return self._steps(state).unranged(state)
+                first = observation.anchor_range
+                return (
+                    self._steps(state).unranged(state) if first is None else phase1_anchor.begun(state, first)
+                )
+            case tasks.Surveying("anchor") | tasks.Homing():
+                return phase1_survey.sensed(state, task, ranged)
+            case tasks.Surveying() | tasks.Listening() | tasks.Retreating():
+                return phase3_survey.sensed(state, task)
             case _:
-                return self._sense(state, ranged)
+                return state
 
     def _steps(self, state: RobotState) -> Steps:
         """Return the steps for the sensors of the mission."""
         return self.CORRECTED if state.estimator.corrects_poses else self.DEAD_RECKONED
 
-    def _sense(self, state: RobotState, ranged: bool) -> RobotState:
-        """Return `state` with the task that follows one that the paper does not have: the robot waits."""
-        del ranged
-        return state
+    def command(self, state: RobotState) -> Command:
+        """Return the command for the next tick, with the phase, the task and the verdict."""
+        return command(state, drive.controls(state))
 
     def report(self, state: RobotState) -> Report:
         """Return the report of this tick: the part of the log that the peer has not acknowledged.

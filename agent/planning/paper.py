@@ -9,12 +9,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agent.planning import drive, exchange, phase1_anchor, phase2_orbit, phase3_turns, plausibility
+from agent.planning import phase1_anchor, phase2_orbit, phase3_turns, plausibility
 from agent.planning.exchange import LogPlanner, Steps
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
 from agent.planning.tasks import Orbiting, Resting, Standing, Waiting
-from protocol.messages import Command, Report
+from protocol.messages import Report
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
 
@@ -50,10 +50,6 @@ class Paper(LogPlanner):
     def rendezvous(self, mission: Mission, distance: float) -> Rendezvous:
         """Return the orbits of eq. (6)."""
         return rendezvous(mission, distance, "paper")
-
-    def command(self, state: RobotState) -> Command:
-        """Return the command for the next tick, with the phase, the task and the verdict."""
-        return exchange.command(state, drive.controls(state))
 
     def _decide_phase3(self, state: RobotState) -> RobotState:
         """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.

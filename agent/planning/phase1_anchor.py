@@ -184,4 +184,4 @@ def _ended(state: RobotState, estimate: AnchorEstimate, kind: BranchKind) -> Rob
     own_anchor = replace(
         estimate.known, branch=estimate.best, kind=kind, done_tick=state.tick, error=estimate.anchor_error
     )
-    return phase2_orbit.begun(replace(state, own_anchor=own_anchor))
+    return phase2_orbit.continued(replace(state, own_anchor=own_anchor))

@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.mission_measurements import path_of
 from agent.estimation.gaussian.own_anchor import anchor_planning_hypotheses, followed, is_anchor_known
-from agent.planning import homing, phase2_pursuit
+from agent.planning import phase2_orbit, range_seeking
 from agent.planning.active_sensing import next_objective, plan_alone
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
@@ -39,7 +39,7 @@ def sensed(state: RobotState, task: Surveying | Homing, ranged: bool) -> RobotSt
     """Return `state` with the task that follows `task`; `ranged` if there is a new range to the anchor."""
     match task:
         case Homing() if not ranged:
-            return homing.onward(state, task)
+            return range_seeking.homeward(state, task)
         case Surveying() if not is_planning_tick(state):
             return state
         case _:
@@ -68,17 +68,17 @@ def continued(state: RobotState, manoeuvres: Manoeuvres | None = None) -> RobotS
     mission, found = state.config.mission, followed(state)
     if found is not None:
         state = replace(state, own_anchor=found)
-    if homing.is_lost(state):
-        return homing.begun(state)
+    if range_seeking.is_lost(state):
+        return range_seeking.turned_back(state)
     if found is None or _are_misleading(state):
         latest = state.log.ranges[-1]
         if latest.tick < state.tick:
-            return homing.begun(state)
+            return range_seeking.turned_back(state)
         return state.doing(Straight("anchor", state.odometry, latest.range))
     if is_anchor_known(state):
         first = state.tick if found.done_tick is None else found.done_tick
         ended = replace(found, kind="three-ranges", done_tick=first)
-        return phase2_pursuit.begun(replace(state, own_anchor=ended))
+        return phase2_orbit.surveyed(replace(state, own_anchor=ended))
     since, objective = next_objective(state, "anchor", (path_of(state.log, 0, state.tick, mission),))
     command = plan_alone(anchor_planning_hypotheses(state), mission, objective=objective)
     return state.doing(Surveying("anchor", command, since))

@@ -14,8 +14,9 @@ from agent.estimation.gaussian.followed_pair import followed
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import MANY_MUTUAL_RANGES, has_failed, m2_of
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
-from agent.planning import homing, phase2_pursuit, range_seeking
+from agent.planning import phase2_orbit, range_seeking
 from agent.planning.active_sensing import CONTINUED, next_objective, plan_together
+from agent.planning.drive import step_length
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
 from agent.planning.tasks import Listening, Retreating, Surveying
@@ -41,9 +42,9 @@ def sensed(state: RobotState, task: Surveying | Listening | Retreating) -> Robot
         case Retreating() if state.in_contact:
             return state.doing(Surveying("peer", since=state.tick))
         case Retreating():
-            return phase2_pursuit.begun(state)
-        case _ if state.config.role == "b" and homing.is_lost(state, LOST_AFTER_IN_PHASE_3):
-            return homing.begun(state)
+            return phase2_orbit.surveyed(state)
+        case _ if state.config.role == "b" and range_seeking.is_lost(state, LOST_AFTER_IN_PHASE_3):
+            return range_seeking.turned_back(state)
         case _ if not state.in_contact:
             back = Controls(0.0 - task.command.v, 0.0 - task.command.omega)
             return state.doing(Retreating(back, state.tick))
@@ -91,7 +92,7 @@ def _drive_without_hypotheses(state: RobotState) -> RobotState:
     mission = state.config.mission
     if state.config.role == "b" or not state.mutual:
         return state.doing(Surveying("peer", since=state.tick))
-    step = range_seeking.step_length("peer", state.mutual[-1].range, mission)
+    step = step_length("peer", state.mutual[-1].range, mission)
     return state.doing(Surveying("peer", Controls(step / mission.period, 0.0), state.tick))
 
 
@@ -102,10 +103,10 @@ def _leave(state: RobotState) -> RobotState:
     """
     config, belief = state.config, state.belief
     if not (config.begins_again and has_failed(state, state.log.ranges[-1].tick, state.tick + 1)):
-        return homing.begun(state)
+        return range_seeking.turned_back(state)
     start = state.start
     if belief.pair:
         here = belief.poses[0]
         local = Pose(here.x - config.anchor.x, here.y - config.anchor.y, here.heading)
         start = compose(local, inverse(state.odometry))
-    return homing.begun_again(state, start)
+    return range_seeking.begun_again(state, start)

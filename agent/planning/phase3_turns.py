@@ -8,8 +8,8 @@ from msgspec.structs import replace
 
 from agent.estimation.estimator import PairEstimate
 from agent.planning import phase3_last_manoeuvre, tasks
+from agent.planning.drive import step_length
 from agent.planning.phase3_last_manoeuvre import Plan, Question
-from agent.planning.range_seeking import step_length
 from agent.planning.state import RobotState
 from protocol.messages import Localised
 from protocol.mission import SHORTEST_STEP, Mission

@@ -1,36 +1,31 @@
-"""The search for a second range to a beacon (Section III.A.2): straight ahead, else on a circle.
+"""The ways to a range: the search for a second one (Section III.A.2), and the way back to the own anchor.
 
-The beacon is the anchor in phase 1, and robot b in phase 3, where robot a takes its second mutual range.
-After the straight, a planner that drives backward also tries the point straight behind before the circle: it
-is reached sooner than a point of the circle, and is mostly in range.
+The search leads straight ahead, else on a circle. The beacon is the anchor in phase 1, and robot b in phase
+3, where robot a takes its second mutual range. After the straight, a planner that drives backward also tries
+the point straight behind before the circle: it is reached sooner than a point of the circle, and is mostly
+in range. Under noise, a robot that has lost its anchor, or has not met its peer, drives back to its anchor.
 """
 
 from __future__ import annotations
 
 import math
 
+from msgspec.structs import replace
+
+from agent.planning import drive
 from agent.planning.planner import Manoeuvres
-from agent.planning.separation import leeway
 from agent.planning.state import RobotState
-from agent.planning.tasks import Backing, Beacon, Circling, Searching, Straight, Turning
-from protocol.mission import Mission
-from protocol.motion import TAU, relative, travelled
-
-
-def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:
-    """Return the length in m of the straight from a point with range `rho0` in m to `beacon`.
-
-    The length is A_0, or less to keep a safety distance from the peer.
-    """
-    step = mission.first_straight
-    return step if beacon == "anchor" else min(step, leeway(rho0, mission))
+from agent.planning.strides import stride
+from agent.planning.tasks import Backing, Circling, Homing, Searching, Straight, Turning
+from protocol.motion import ORIGIN, Pose, inverse, relative, travelled
+from protocol.team_motion import next_on_spiral
 
 
 def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoeuvres) -> Searching | None:
     """Return the task after a tick of `task`, or None once the second range is `measured`."""
     pose, tolerance = state.odometry, state.estimator.pose_tolerance
     distance_tolerance = tolerance * state.config.mission.first_straight
-    step = step_length(task.beacon, task.rho0, state.config.mission)
+    step = drive.step_length(task.beacon, task.rho0, state.config.mission)
     match task:
         case Straight(beacon, origin, rho0):
             if travelled(origin, pose) < step - distance_tolerance:
@@ -50,12 +45,42 @@ def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoe
             return None if measured else task
 
 
-def inside_arc(rho0: float, radius: float, reach: float) -> float:
-    """Return 2 pi - 2 eta in rad (Section III.A.2): the part of a circle that is in range of the beacon.
+# --- the way back, under noise ------------------------------------------------------------------------
 
-    The circle has the radius `radius` and its centre is `rho0` from the beacon, whose range is `reach`; all
-    in m.
+LOST_AFTER = 3
+"""The number of strides without an expected anchor detection after which the robot returns to its anchor."""
+
+
+def homeward(state: RobotState, task: Homing) -> RobotState:
+    """Return `state` after a tick of `task` without a range: at the place, on a spiral or as at the start."""
+    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
+    if drive.homing(task.place, state.odometry, mission, tolerance) is not None:
+        return state
+    if task.side is None:
+        return state.doing(Straight("anchor", state.odometry, 0.0))
+    x, y = next_on_spiral((task.place.x, task.place.y), task.side, mission)
+    return state.doing(Homing(Pose(x, y, 0.0), task.side + 1))
+
+
+def is_lost(state: RobotState, strides: int = LOST_AFTER) -> bool:
+    """Return whether the robot has had no range to its anchor for so many `strides`."""
+    return state.tick - state.log.ranges[-1].tick >= strides * stride(state.config.mission)
+
+
+def turned_back(state: RobotState) -> RobotState:
+    """Drive back to the place of the last anchor range, and discard all hypotheses."""
+    last_range_tick = state.log.ranges[-1].tick
+    place = state.log.pose(ORIGIN, last_range_tick, state.config.mission.period)
+    own_anchor = replace(state.own_anchor, hypotheses=())
+    attempt = replace(state.belief.attempt, returns=state.belief.attempt.returns + 1)
+    belief = replace(state.belief, encounter_tick=None, pair=(), attempt=attempt)
+    return replace(state, task=Homing(place), own_anchor=own_anchor, belief=belief)
+
+
+def begun_again(state: RobotState, start: Pose) -> RobotState:
+    """Drive to where the anchor should be if a started at `start` (see `Branch`), to measure phase 1 again.
+
+    The place of the last range is on the rim of the anchor's range, which a robot misses more easily.
     """
-    rho0 = min(rho0, reach)  # an outlier may be longer than R
-    cosine = (reach * reach - rho0 * rho0 - radius * radius) / (2.0 * radius * rho0) if rho0 > 0.0 else 1.0
-    return TAU - 2.0 * math.acos(min(1.0, max(-1.0, cosine)))
+    anchor = inverse(start)
+    return turned_back(state).doing(Homing(Pose(anchor.x, anchor.y, 0.0), 0))

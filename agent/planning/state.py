@@ -15,7 +15,6 @@ from agent.planning.phase3_last_manoeuvre import Plan
 from agent.planning.tasks import Asleep, Done, Looping, Sweeping, Task
 from protocol.messages import Localised, Undecided, Verdict
 from protocol.motion import ORIGIN, Pose, compose, inverse
-from protocol.orbits import Orbit
 
 
 class RobotState(Knowledge, frozen=True):
@@ -35,11 +34,6 @@ class RobotState(Knowledge, frozen=True):
     def estimator(self) -> Estimator:
         """Return the estimator for the noise of the mission."""
         return EXACT_ESTIMATOR if self.config.mission.noise.exact else GAUSSIAN
-
-    @property
-    def orbit(self) -> Orbit:
-        """Return the orbit of this robot in phase 2."""
-        return self.config.orbit
 
     @property
     def phase(self) -> int:

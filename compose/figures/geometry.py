@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Arc
 
-from agent.planning.range_seeking import inside_arc
+from agent.planning.drive import inside_arc
 from compose.figures.pair import PairRecord
 from compose.figures.sheet import (
     LABEL,
