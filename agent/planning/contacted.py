@@ -21,7 +21,7 @@ from agent.planning import sweep
 from agent.planning.planner import Summary
 from agent.planning.state import RobotState
 from agent.planning.tasks import Awaiting, Done, Looping, Standing, Sweeping
-from protocol.messages import Estimate, Localised, Observation, Ranged, Report
+from protocol.messages import Estimate, Localised, Report
 from protocol.motion import Covariance, Pose
 from protocol.sweep_strips import OWN_SIDE
 from protocol.sweep_ticks import contact_ticks
@@ -63,16 +63,6 @@ class Contacted(msgspec.Struct, frozen=True):
     """The number of ranges to the finder at the latest estimate."""
     failure: str = "no localised robot has found it"
     """The reason for which it has no claim yet."""
-
-    def ranged(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the ranges of `observation`, without those that are too old."""
-        for contact in observation.contacts:
-            if contact.range is not None:
-                other, first = state.other(contact.peer), observation.tick - _kept(state)
-                recent = [each for each in other.mutual if each.tick > first]
-                mutual = (*recent, Ranged(observation.tick, contact.range))
-                state = state.with_other(contact.peer, mutual=mutual)
-        return state
 
     def told(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
@@ -123,7 +113,7 @@ class Contacted(msgspec.Struct, frozen=True):
 
 
 def _kept(state: RobotState) -> int:
-    """Return the ticks for which a range is kept, and after which a silent finder is forgotten."""
+    """Return the ticks after which a range counts no more, and a silent finder is forgotten."""
     return 2 * contact_ticks(state.config.mission)
 
 
@@ -156,11 +146,11 @@ def _estimated(state: RobotState, found: Contacted) -> tuple[Contacted, Localise
     if sigma > mission.accuracy:
         why = f"{finder.robot} knows its position to {sigma:.3g} m, required {mission.accuracy:g}"
         return replace(found, failure=why), None
-    ends = finder.reference, min(finder.log.through, state.tick)
+    first, last = max(finder.reference, state.tick - _kept(state) + 1), min(finder.log.through, state.tick)
     ranges = [
         (one.tick - finder.reference, one.range)
-        for one in state.other(finder.robot).mutual
-        if ends[0] <= one.tick <= ends[1]
+        for one in state.ranges_to(finder.robot)
+        if first <= one.tick <= last
     ]
     if (
         len(ranges) < max(FEWEST_FOR_POSE, found.ranges_at_estimate + EACH)

@@ -41,7 +41,7 @@ from protocol.motion import REST, Controls, Pose, compose, inverse, step
 
 
 def observed(state: RobotState, observation: Observation) -> RobotState:
-    """Return `state` with the sensor data of one tick: odometry, anchor range, contact and mutual range."""
+    """Return `state` with the sensor data of one tick: odometry, ranges, and contact with the peer."""
     log, odometry, leg = state.log, state.odometry, state.leg
     if (executed := observation.executed) is not None:
         log = log.drove(executed.v, executed.omega)
@@ -51,19 +51,22 @@ def observed(state: RobotState, observation: Observation) -> RobotState:
         odometry = step(leg, executed.v, executed.omega, ticks * state.config.mission.period)
     if observation.anchor_range is not None and state.estimator.is_informative(state, observation):
         log = log.ranged(observation.anchor_range)
-    mutual, in_contact = state.mutual, False
+    mutual = state.mutual
     for contact in observation.contacts:
+        if contact.range is None:
+            continue
+        latest = Ranged(observation.tick, contact.range)
         if contact.peer == state.config.peer:
-            in_contact = True
-            if contact.range is not None:
-                mutual = (*mutual, Ranged(observation.tick, contact.range))
+            mutual = (*mutual, latest)
+        else:
+            state = state.with_other(contact.peer, mutual=(*state.other(contact.peer).mutual, latest))
     return replace(
         state,
         tick=observation.tick,
         odometry=odometry,
         log=log,
         mutual=mutual,
-        in_contact=in_contact,
+        in_contact=any(contact.peer == state.config.peer for contact in observation.contacts),
         leg=leg,
     )
 

@@ -68,7 +68,6 @@ class GroupPlanner(Planner[RobotState, Report]):
         before, state = state, self.pair_planner.observe(state, observation)
         if state.in_contact and (before.agenda.alone or appointments.refused(before, state.config.peer)):
             state = replace(state, in_contact=False)
-        state = meetings.with_ranges(state, observation)
         if state.agenda.visiting and _is_out_of_range_again(before, state):
             state = state.doing(Travelling(visit.stop(state)))
         state = visit.passing_others(state, observation.contacts)

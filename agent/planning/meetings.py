@@ -11,7 +11,7 @@ from agent.planning import appointments, searching, sweep, visit
 from agent.planning.agenda import Fix
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
-from protocol.messages import Localised, Observation, Ranged, Report, Undecided
+from protocol.messages import Localised, Report, Undecided
 
 PARTED_AFTER = 8
 """The ticks out of range of a peer after which a robot whose meeting has ended goes on.
@@ -22,15 +22,6 @@ has received that of this robot before.
 
 LINGERING = 6
 """The ticks in contact for which a visited robot waits for its visitor to leave, with a safety distance."""
-
-
-def with_ranges(state: RobotState, observation: Observation) -> RobotState:
-    """Return `state` with the ranges of `observation` to all robots but the peer."""
-    for contact in observation.contacts:
-        if contact.peer != state.config.peer and contact.range is not None:
-            latest = Ranged(observation.tick, contact.range)
-            state = state.with_other(contact.peer, mutual=(*state.other(contact.peer).mutual, latest))
-    return state
 
 
 def with_sender(state: RobotState, report: Report) -> RobotState:

@@ -23,7 +23,7 @@ from agent.planning.planner import Summary
 from agent.planning.searching import LOOPS_FOR
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Awaiting, Done, Looping, Standing
-from protocol.messages import Estimate, Localised, Observation, Report
+from protocol.messages import Estimate, Localised, Report
 from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
 from protocol.rounding import SURE
 
@@ -34,7 +34,7 @@ It is far above the rounding errors of the poses of both robots, and far below w
 """
 
 KEPT = 64
-"""The number of ticks for which a range is kept until the report of that tick arrives."""
+"""The number of ticks within which the report of the tick of a range has to arrive."""
 
 AGREE = SURE
 """The largest difference in m and rad between poses that two robots confirm.
@@ -48,8 +48,8 @@ class Resected(msgspec.Struct, frozen=True):
 
     base: Pose = ORIGIN
     """The odometry at the place where it stands, or stood before its square."""
-    ranges: Mapping[tuple[str, int], tuple[float, Pose]] = {}
-    """The ranges without a reported pose yet, with the own pose relative to `base`, by robot and tick."""
+    since: int = -1
+    """The tick after which its ranges count."""
     places: Mapping[tuple[str, int], RangedPlace] = {}
     """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
     possible: tuple[Pose, ...] = ()
@@ -57,33 +57,21 @@ class Resected(msgspec.Struct, frozen=True):
     candidates: Mapping[str, Pose] = {}
     """The pose in <W> of the frame of the odometry, by the robot from whose reports it follows."""
 
-    def ranged(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the ranges of `observation`, without those that are too old."""
-        # where it stands, rounding must not look like a motion
-        moved = compose(inverse(self.base), state.odometry) if state.odometry != self.base else ORIGIN
-        new = {
-            (contact.peer, observation.tick): (contact.range, moved)
-            for contact in observation.contacts
-            if contact.range is not None
-        }
-        first = observation.tick - KEPT
-        recent = {key: contact for key, contact in self.ranges.items() if key[1] > first}
-        return state.with_agenda(found=replace(self, ranges={**recent, **new})) if new else state
-
     def told(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
-        ranges, places, found = dict(self.ranges), dict(self.places), self
+        places, found = dict(self.places), self
         if not isinstance(state.task, Looping):  # a robot that comes back may have corrected its pose
             places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
         for report in reports:
-            if (prior := report.prior) is None or report.robot in self.candidates:
+            key = report.robot, report.prior.tick if report.prior is not None else -1
+            if report.prior is None or report.robot in self.candidates or key in places:
                 continue
-            if (ranged := ranges.pop((report.robot, prior.tick), None)) is not None:
-                distance, odometry = ranged
-                place = RangedPlace((prior.pose.x, prior.pose.y), odometry, distance)
-                places[report.robot, prior.tick] = place
+            there = report.prior.pose.x, report.prior.pose.y
+            for one in state.ranges_to(report.robot)[-KEPT:]:
+                if one.tick == report.prior.tick > max(self.since, state.tick - KEPT):
+                    places[key] = RangedPlace(there, _moved(state, self.base, one.tick), one.range)
         if places.keys() != self.places.keys():
-            state, found = _resected(state, replace(self, ranges=ranges, places=places))
+            state, found = _resected(state, replace(self, places=places))
             state = state.with_agenda(found=found)
         return _moved_on(state, found) if state.verdict is None else state
 
@@ -113,6 +101,13 @@ class Resected(msgspec.Struct, frozen=True):
         """Return the number of possible poses."""
         del state
         return Summary(hypotheses=len(self.possible) or len(self.candidates) or None)
+
+
+def _moved(state: RobotState, base: Pose, tick: int) -> Pose:
+    """Return the pose of this robot at `tick` relative to `base`, both by dead reckoning."""
+    odometry = state.log.pose(ORIGIN, tick, state.config.mission.period)
+    # where it stands, rounding must not look like a motion
+    return compose(inverse(base), odometry) if odometry != base else ORIGIN
 
 
 def _now(state: RobotState, found: Resected, base: Pose) -> Pose:
@@ -173,5 +168,5 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     latest = max([tick for robot, tick in found.places if robot not in found.candidates], default=-KEPT)
     if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
         return state.doing(sweep.looping(state.odometry, mission, since))
-    found = Resected(state.odometry, candidates=found.candidates)
+    found = Resected(state.odometry, state.tick, candidates=found.candidates)
     return state.doing(Standing() if found.candidates else Awaiting()).with_agenda(found=found)

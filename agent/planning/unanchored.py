@@ -44,10 +44,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the odometry and the ranges of one tick."""
-        state = exchange.observed(state, observation)
-        if state.agenda.robot_verdict is not None:
-            return meetings.with_ranges(state, observation) if _searches(state) else state
-        return _found(state).ranged(state, observation)
+        return exchange.observed(state, observation)
 
     def report(self, state: RobotState) -> Report:
         """Return the report to a robot that has not found it: without a log, as it is in no meeting."""
