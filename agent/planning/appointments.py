@@ -181,6 +181,12 @@ def parted(state: RobotState, failure: Verdict | None = None) -> RobotState:
     return failed.with_agenda(failure=failure) if failure is not None else failed
 
 
+def withdrawn(state: RobotState, peer: str, failure: Verdict) -> RobotState:
+    """Return `state` of a robot that knows its pose no more, by `failure`, and which meets `peer` no more."""
+    failed = state.with_other(peer, failed=True)
+    return failed.with_agenda(robot_verdict=None, fix=None, located=None, failure=failure)
+
+
 def is_met(state: RobotState) -> bool:
     """Return whether this robot is in contact with its peer, in a meeting that may still localise it.
 

@@ -21,10 +21,8 @@ from agent.planning import (
     confirmation,
     exchange,
     meetings,
-    own_pose,
     plausibility,
     searching,
-    sweep,
     visit,
 )
 from agent.planning.exchange import LogPlanner
@@ -89,12 +87,11 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        noisy = sweep.reports_covariance(state)
-        if noisy and searching.is_helped(state, peer):
+        if searching.is_helped(state, peer):
             return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):
             report = exchange.report_without_log(state, state.agenda.failure)
-        elif peer == state.config.peer and (state.meets or (noisy and state.sweeps)):
+        elif peer == state.config.peer and (state.meets or searching.has_beacon(state)):
             return self.report(state)
         else:
             report = searching.outside_meeting(state, peer)
@@ -202,7 +199,7 @@ def _apart(state: RobotState, reports: Sequence[Report]) -> RobotState:
     heard = plausibility.with_reports(state, of_peer)
     if heard.verdict == state.verdict:
         state = heard
-    return meetings.onward(own_pose.updated(state)) if state.sweeps else state
+    return meetings.onward(state) if state.sweeps else state
 
 
 def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:

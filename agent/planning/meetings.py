@@ -6,9 +6,9 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.claim_agreement import difference
 from agent.planning import appointments, searching, sweep, visit
 from agent.planning.agenda import Fix
+from agent.planning.own_pose import contradiction
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
 from protocol.messages import Localised, Report, Undecided
@@ -75,8 +75,8 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
         fix = Fix(state.tick, claim, (peer,))
         return state.with_agenda(fix=fix, located=known, confirming=confirming).with_frame(claim.pose)
     state = state.with_other(peer, localised=True)
-    contradiction = _contradiction(state, claim)
-    if contradiction is None:
+    off = contradiction(state, claim)
+    if off is None:
         fix = Fix(state.tick, claim, (*(fix.peers if fix is not None else ()), peer))
         state = state.with_agenda(fix=fix, located=known).with_frame(claim.pose)
         return state if agenda.robot_verdict is not None else state.with_agenda(robot_verdict=claim)
@@ -84,25 +84,8 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
     if len(fix.peers) > 1:
         return appointments.parted(state)
     (other,) = fix.peers
-    state = state.with_other(other, failed=True)
-    return state.with_agenda(robot_verdict=None, fix=None, located=None, failure=contradiction)
-
-
-def _contradiction(state: RobotState, claim: Localised) -> Undecided | None:
-    """Return how `claim`, of the present meeting, contradicts the known pose; None if it does not.
-
-    The claims of robots with exact sensors have no covariance, and are never wrong.
-    """
-    fix, mission = state.agenda.fix, state.config.mission
-    if fix is None or claim.covariance is None:
-        return None
-    off = difference(fix.claim, fix.tick, claim, state.tick, state.log, mission)
-    if off.p_value >= 1.0 - mission.confidence:
-        return None
-    return Undecided(
-        f"{fix.peers[-1]} and {state.config.peer} contradict each other: by their reports, its pose differs "
-        f"by {off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
-    )
+    why = f"{other} and {peer} contradict each other: by their reports, its pose differs by {off}"
+    return appointments.withdrawn(state, other, Undecided(why))
 
 
 def _on_sweep(state: RobotState) -> RobotState:
@@ -115,10 +98,7 @@ def _on_sweep(state: RobotState) -> RobotState:
     swept, done = searching.swept(state), Done(state.phase, agenda.robot_verdict)
     if swept.verdict is None:
         return appointments.next_visit(swept.doing(done)) if sweep.is_over(swept) else swept
-    state = swept.with_agenda(
-        robot_verdict=None, fix=None, located=None, failure=swept.verdict, visiting=False
-    )
-    return appointments.waiting(appointments.parted(state), peer)
+    return appointments.waiting(appointments.withdrawn(swept, peer, swept.verdict), peer)
 
 
 def after_refusal(state: RobotState) -> RobotState:

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from msgspec.structs import astuple, replace
 
 from agent.estimation.claim import NORMAL_RATIO, Blocked, blocked, claim, consistency, convergence
+from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.gaussian.search import search
@@ -74,6 +75,20 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     state = _with_estimate(state, found, judged)
     reference = _reference(state, judged)
     return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
+
+
+def contradiction(state: RobotState, claim: Localised) -> str | None:
+    """Return by how much the present `claim` contradicts the pose that the robot knows; None if it does not.
+
+    The claims of robots with exact sensors have no covariance, and are never wrong.
+    """
+    fix, mission = state.agenda.fix, state.config.mission
+    if fix is None or claim.covariance is None:
+        return None
+    off = difference(fix.claim, fix.tick, claim, state.tick, state.log, mission)
+    if off.p_value >= 1.0 - mission.confidence:
+        return None
+    return f"{off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
 
 
 def beacon_place(state: RobotState) -> Place:

@@ -13,7 +13,6 @@ from functools import partial
 
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.claim_agreement import difference
 from agent.planning import exchange, own_pose, sweep
 from agent.planning.agenda import Other
 from agent.planning.state import RobotState
@@ -48,17 +47,22 @@ def is_helped(state: RobotState, robot: str) -> bool:
     return robot in state.config.unanchored and not finished
 
 
+def has_beacon(state: RobotState) -> bool:
+    """Return whether the robot sweeps with its latest peer as a beacon, which goes on to get its log."""
+    return state.sweeps and sweep.reports_covariance(state)
+
+
 def is_apart(state: RobotState) -> bool:
     """Return whether the robot is in no meeting any more: it sweeps, or is the beacon of one that does.
 
     A beacon stays where it is: it sweeps no part, and its planned meetings are over.
     """
     config, agenda = state.config, state.agenda
-    if not sweep.reports_covariance(state):
-        return False
-    assert config.sweep is not None
-    if state.sweeps or config.part < config.sweep.parts or agenda.visits < len(config.visits):
+    if state.sweeps or not sweep.reports_covariance(state):
         return state.sweeps
+    assert config.sweep is not None
+    if config.part < config.sweep.parts or agenda.visits < len(config.visits):
+        return False
     return isinstance(state.verdict, Localised) and isinstance(agenda.robot_verdict, Localised)
 
 
@@ -129,7 +133,7 @@ def swept(state: RobotState) -> RobotState:
     """
     mission, odometry, helped = state.config.mission, state.odometry, _helped(state)
     if sweep.reports_covariance(state):
-        state = _with_contact(state, helped)
+        state = _with_contact(own_pose.updated(state), helped)
         if state.verdict is not None:
             return state
         helped = [one for one in helped if _ticks_since(state, one) <= LINGER]
@@ -165,16 +169,16 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single
     meeting is then withdrawn. If several meetings agree on the claim, there is no reference.
     """
-    fix, mission = state.agenda.fix, state.config.mission
+    fix, off = (
+        state.agenda.fix,
+        own_pose.contradiction(state, Localised(reference.pose, reference.covariance)),
+    )
     assert fix is not None
-    now = Localised(reference.pose, reference.covariance)
-    off = difference(fix.claim, fix.tick, now, reference.tick, state.log, mission)
-    if off.p_value >= 1.0 - mission.confidence:
+    if off is None:
         return _with_reference(state, reference)
     if len(fix.peers) > 1:
         return state
-    why = f"its ranges since its claim contradict it by {off.position:.3g} m and {off.heading:.3g} rad"
-    return state.undecided(f"{why} (p = {off.p_value:.2g})")
+    return state.undecided(f"its ranges since its claim contradict it by {off}")
 
 
 def _helped(state: RobotState) -> list[str]:
@@ -208,10 +212,7 @@ def _has_passed(other: Other, tick: int, near: float) -> bool:
 
 def _is_near(state: RobotState, robot: str) -> bool:
     """Return whether this robot is near enough to `robot` to drive a square, or drives one already."""
-    other = state.other(robot)
-    if not other.mutual or other.mutual[-1].tick != state.tick:
+    near = STRIP_REACH * state.config.mission.sensing_range
+    if _ticks_since(state, robot) > 0:
         return False
-    return (
-        isinstance(state.task, Looping)
-        or other.mutual[-1].range <= STRIP_REACH * state.config.mission.sensing_range
-    )
+    return isinstance(state.task, Looping) or state.other(robot).mutual[-1].range <= near
