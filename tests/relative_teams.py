@@ -22,13 +22,13 @@ from msgspec.structs import replace
 from agent.estimation.fit import AS_IT_IS, Start, fits
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.planning import team_tasks
-from agent.planning.drive import homing
+from agent.planning.drive import towards
 from agent.planning.team_state import TeamState
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
 from compose.scenario.scenario_file import parse
 from protocol.messages import Localised, Undecided
-from protocol.motion import ORIGIN, REST, Controls
+from protocol.motion import REST, Controls
 from tests.plans import table
 
 SIZES = (2, 3, 4, 8)
@@ -75,7 +75,9 @@ def at_random(seed: int, state: TeamState) -> TeamState:
     if isinstance(state.verdict, Undecided) or (state.verdict is not None and not state.waiting):
         return state.doing_next("localised", 3, REST)
     if math.hypot(here.x, here.y) >= mission.sensing_range:
-        return state.doing_next("homing", 1, homing(ORIGIN, here, mission, team_tasks.ARRIVED))
+        return state.doing_next(
+            "homing", 1, towards((0.0, 0.0), here, mission, team_tasks.ARRIVED, backward=True)
+        )
     draw = random.Random(f"{seed}/{state.config.robot}/{state.tick}").uniform
     turn = draw(-mission.max_turn_rate, mission.max_turn_rate)
     return state.doing_next("circling", 1, Controls(draw(0.0, mission.max_speed), turn))

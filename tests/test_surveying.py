@@ -15,7 +15,7 @@ from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.planning.active_sensing import plan_alone, plan_together
-from agent.planning.drive import homing, pursuit
+from agent.planning.drive import pursuit, towards
 from agent.planning.strides import STRIDES_AHEAD, choice, stride
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
@@ -156,11 +156,11 @@ def test_from_anywhere_a_robot_finds_home(
     if exact:
         mission = replace(mission, noise=Noise())
     tolerance = (EXACT_ESTIMATOR if mission.noise.exact else GAUSSIAN).pose_tolerance
-    pose, place = Pose(x, y, heading), Pose(1.0, -2.0, 0.5)
+    pose = Pose(x, y, heading)
     far = math.hypot(x - 1.0, y + 2.0)
     legs = far / (mission.max_speed * mission.period) + math.pi / (mission.max_turn_rate * mission.period)
     for _ in range(math.ceil(1.2 * legs) + 10):
-        command = homing(place, pose, mission, tolerance)
+        command = towards((1.0, -2.0), pose, mission, tolerance, backward=True)
         if command is None:
             break
         assert abs(command.v) <= mission.max_speed

@@ -51,10 +51,9 @@ def controls(state: RobotState) -> Controls:
             | tasks.Retreating()
         ):
             return task.command
-        case tasks.Homing(place):
-            return homing(place, odometry, mission, state.estimator.pose_tolerance) or REST
-        case tasks.Travelling(place):
-            return towards(place, odometry, mission, state.estimator.pose_tolerance) or REST
+        case tasks.Homing(place) | tasks.Travelling(place):
+            back = isinstance(task, tasks.Homing)
+            return towards(place, odometry, mission, state.estimator.pose_tolerance, backward=back) or REST
         case tasks.Sweeping((place, *_)) | tasks.Looping((place, *_)):
             way = towards(place, odometry, mission, state.estimator.pose_tolerance) or REST
             return Controls(min(way.v, sweep_speed(mission)), way.omega)
@@ -88,34 +87,23 @@ def left_to_orbit(state: RobotState) -> float:
     return state.config.orbit.radius - math.hypot(local.x, local.y)
 
 
-def homing(place: Pose, pose: Pose, mission: Mission, tolerance: float) -> Controls | None:
-    """Return the controls from `pose` to `place`, or None once the robot is there.
-
-    The robot drives backward if that needs the smaller turn. `tolerance` is `Estimator.pose_tolerance`.
-    """
-    distance = travelled(pose, place)
-    if distance <= tolerance * mission.first_straight:
-        return None
-    bearing_error = wrap(math.atan2(place.y - pose.y, place.x - pose.x) - pose.heading)
-    forward = abs(bearing_error) <= math.pi / 2
-    remaining_turn = bearing_error if forward else wrap(bearing_error + math.pi)
-    if abs(remaining_turn) > tolerance:
-        return turn(pose, pose.heading + remaining_turn, mission)
-    return straight(distance if forward else -distance, mission)
-
-
-def towards(place: Place, odometry: Pose, mission: Mission, tolerance: float) -> Controls | None:
+def towards(
+    place: Place, odometry: Pose, mission: Mission, tolerance: float, *, backward: bool = False
+) -> Controls | None:
     """Return the controls from the pose `odometry` to `place`: a turn, then straight on; None on arrival.
 
-    `tolerance` is `Estimator.pose_tolerance`.
+    With `backward`, the robot drives backward if that needs the smaller turn. `tolerance` is
+    `Estimator.pose_tolerance`.
     """
     dx, dy = place[0] - odometry.x, place[1] - odometry.y
     distance = math.hypot(dx, dy)
     if distance <= tolerance * mission.first_straight:
         return None
     bearing = wrap(math.atan2(dy, dx) - odometry.heading)
+    if backward and abs(bearing) > math.pi / 2:
+        bearing, distance = wrap(bearing + math.pi), -distance
     # a tick of driving that begins with a small error of the heading ends beside the place by that error
-    if abs(bearing) > max(tolerance, ASIDE * mission.first_straight / distance):
+    if abs(bearing) > max(tolerance, ASIDE * mission.first_straight / abs(distance)):
         return turn(odometry, odometry.heading + bearing, mission)
     return straight(distance, mission)
 

@@ -54,12 +54,11 @@ LOST_AFTER = 3
 def homeward(state: RobotState, task: Homing) -> RobotState:
     """Return `state` after a tick of `task` without a range: at the place, on a spiral or as at the start."""
     mission, tolerance = state.config.mission, state.estimator.pose_tolerance
-    if drive.homing(task.place, state.odometry, mission, tolerance) is not None:
+    if drive.towards(task.place, state.odometry, mission, tolerance) is not None:
         return state
     if task.side is None:
         return state.doing(Straight("anchor", state.odometry, 0.0))
-    x, y = next_on_spiral((task.place.x, task.place.y), task.side, mission)
-    return state.doing(Homing(Pose(x, y, 0.0), task.side + 1))
+    return state.doing(Homing(next_on_spiral(task.place, task.side, mission), task.side + 1))
 
 
 def is_lost(state: RobotState, strides: int = LOST_AFTER) -> bool:
@@ -74,7 +73,7 @@ def turned_back(state: RobotState) -> RobotState:
     own_anchor = replace(state.own_anchor, hypotheses=())
     attempt = replace(state.belief.attempt, returns=state.belief.attempt.returns + 1)
     belief = replace(state.belief, encounter_tick=None, pair=(), attempt=attempt)
-    return replace(state, task=Homing(place), own_anchor=own_anchor, belief=belief)
+    return replace(state, task=Homing((place.x, place.y)), own_anchor=own_anchor, belief=belief)
 
 
 def begun_again(state: RobotState, start: Pose) -> RobotState:
@@ -83,4 +82,4 @@ def begun_again(state: RobotState, start: Pose) -> RobotState:
     The place of the last range is on the rim of the anchor's range, which a robot misses more easily.
     """
     anchor = inverse(start)
-    return turned_back(state).doing(Homing(Pose(anchor.x, anchor.y, 0.0), 0))
+    return turned_back(state).doing(Homing((anchor.x, anchor.y), 0))

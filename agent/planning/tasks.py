@@ -103,8 +103,8 @@ class Homing(msgspec.Struct, frozen=True):
 
     name: ClassVar[str] = "homing"
     phase: ClassVar[int] = 1
-    place: Pose
-    """The place, in the frame of the odometry."""
+    place: Place
+    """The place, in m in the frame of the odometry."""
     side: int | None = None
     """The number of sides of the spiral up to this place; None without a spiral."""
 

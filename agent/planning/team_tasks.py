@@ -22,7 +22,7 @@ from agent.estimation.posterior import Hypothesis
 from agent.planning import separation
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.agenda import Bypass
-from agent.planning.drive import homing, pursuit, towards
+from agent.planning.drive import pursuit, towards
 from agent.planning.strides import stride
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
 from agent.planning.visit import CLEARANCE
@@ -126,7 +126,7 @@ def _aside(passing: Bypass, state: TeamState) -> Controls | None:
     """Return the controls to the next place of the way aside; None if it is there, or on no such way."""
     if not passing.places:
         return None
-    return homing(Pose(*passing.places[0], 0.0), state.odometry, state.config.mission, ARRIVED)
+    return towards(passing.places[0], state.odometry, state.config.mission, ARRIVED, backward=True)
 
 
 def _at_rest(state: TeamState) -> TeamState | None:

@@ -46,15 +46,14 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
         """Return `state` with the odometry and the ranges of one tick."""
         return exchange.observed(state, observation)
 
-    def report(self, state: RobotState) -> Report:
-        """Return the report to a robot that has not found it: without a log, as it is in no meeting."""
-        return exchange.report_without_log(state, state.agenda.robot_verdict)
-
     def report_to(self, state: RobotState, peer: str) -> Report:
-        """Return the report to `peer`. Once localised, it has the pose for others without an anchor."""
+        """Return the report to `peer`, without a log, as this robot is in no meeting.
+
+        Once localised, it has the pose for others without an anchor.
+        """
         if _searches(state):
             return searching.outside_meeting(state, peer)
-        return _found(state).answered(self.report(state), peer)
+        return _found(state).answered(exchange.report_without_log(state, state.agenda.robot_verdict), peer)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose.
