@@ -22,7 +22,7 @@ import numpy as np
 from agent.estimation import exact_estimator
 from agent.estimation.gaussian import planning_hypotheses
 from agent.peer import peer_state
-from agent.planning import phase3_survey
+from agent.planning import phase3_encounter
 from agent.process import node
 from compose.recording import run
 from compose.scenario import group_meetings
@@ -131,10 +131,10 @@ def bound() -> None:
 def clock() -> None:
     """A retreat begins at the time of the clock, not at the tick."""
     edited(
-        phase3_survey,
+        phase3_encounter,
         "sensed",
-        "Retreating(back, state.tick)",
-        "Retreating(back, __import__('time').monotonic_ns() % 1000)",
+        "tasks.Retreating(back, state.tick)",
+        "tasks.Retreating(back, __import__('time').monotonic_ns() % 1000)",
     )
 
 

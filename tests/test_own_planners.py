@@ -391,9 +391,10 @@ def test_such_a_planner_helps_nobody_and_that_is_one_line(
 
 
 def test_a_group_refuses_a_body_that_its_planner_does_not_take_and_a_log_in_its_place() -> None:
-    planner = planner_of(believing(3, 1).config("r0"))
-    state = planner.observe(planner.start(believing(3, 1).config("r0")), Observation(0, "r0", None, 1.0))
-    good = planner.report(state)
+    config = believing(3, 1).config("r0")
+    planner = planner_of(config)
+    state = planner.observe(planner.start(config), Observation(0, "r0", None, 1.0))
+    good = planner.report_to(state, config.peer)
     assert planner.malformed(good) is None
     assert planner.malformed(replace(good, body=b"\x83")) == "its body: Input data was truncated"
     log = Report(5, "r1", start=ORIGIN)

@@ -2,7 +2,7 @@
 
 With exact sensors, it follows the paper's phases with more manoeuvres to choose from, until one placement is
 left and a redundant range has confirmed it. With noisy sensors, it measures until the poses are as accurate
-as the mission asks, in the phases of the paper (`phase1_survey`, `phase2_orbit`, `phase3_survey`).
+as the mission asks, in the phases of the paper (`phase1_anchor`, `phase2_orbit`, `phase3_encounter`).
 """
 
 from __future__ import annotations
@@ -14,10 +14,8 @@ from agent.planning import (
     active_sensing,
     exchange,
     phase1_anchor,
-    phase1_survey,
     phase2_orbit,
-    phase3_survey,
-    phase3_turns,
+    phase3_encounter,
     plausibility,
     tasks,
 )
@@ -39,11 +37,11 @@ class Assured(LogPlanner):
     )
     """Both ways, to both sides in phase 1, and at several speeds."""
     DEAD_RECKONED = Steps(
-        phase1_anchor.unranged, phase1_anchor.until_accurate, phase2_orbit.continued, phase3_turns.met
+        phase1_anchor.unranged, phase1_anchor.until_accurate, phase2_orbit.continued, phase3_encounter.met
     )
     """The paper's steps, with more manoeuvres to choose from."""
     CORRECTED = Steps(
-        phase1_survey.unranged, phase1_survey.continued, phase2_orbit.surveyed, phase3_survey.decided
+        phase1_anchor.still_unranged, phase1_anchor.surveyed, phase2_orbit.surveyed, phase3_encounter.surveyed
     )
     ACTIVE_SENSING = True
 
@@ -57,9 +55,9 @@ class Assured(LogPlanner):
             case tasks.Orbital() | tasks.Travelling():
                 return self._steps(state).phase3(state, self.joint_manoeuvres)
             case tasks.Resting():
-                return phase3_turns.decided(state, self.last_manoeuvre)
+                return phase3_encounter.decided(state, self.last_manoeuvre)
             case tasks.Listening() | tasks.Surveying("peer") if is_planning_tick(state):
-                return phase3_survey.decided(state, self.joint_manoeuvres)
+                return phase3_encounter.surveyed(state, self.joint_manoeuvres)
             case _:
                 return state
 

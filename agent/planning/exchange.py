@@ -15,10 +15,8 @@ from agent.peer.motion_log import MotionLog
 from agent.planning import (
     drive,
     phase1_anchor,
-    phase1_survey,
+    phase3_encounter,
     phase3_last_manoeuvre,
-    phase3_survey,
-    phase3_turns,
     range_seeking,
     separation,
     tasks,
@@ -191,16 +189,16 @@ class LogPlanner(Planner[RobotState, Report]):
             case tasks.ThirdPoint(_, origin) if state.odometry != origin:
                 return self._steps(state).phase1(state, self.MANOEUVRES)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
-                return phase3_turns.after_last_manoeuvre(state, task)
+                return phase3_encounter.after_last_manoeuvre(state, task)
             case tasks.Asleep():
                 first = observation.anchor_range
                 return (
                     self._steps(state).unranged(state) if first is None else phase1_anchor.begun(state, first)
                 )
             case tasks.Surveying("anchor") | tasks.Homing():
-                return phase1_survey.sensed(state, task, ranged)
+                return phase1_anchor.sensed(state, task, ranged)
             case tasks.Surveying() | tasks.Listening() | tasks.Retreating():
-                return phase3_survey.sensed(state, task)
+                return phase3_encounter.sensed(state, task)
             case _:
                 return state
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from agent.planning import phase1_anchor, phase2_orbit, phase3_turns, plausibility
+from agent.planning import phase1_anchor, phase2_orbit, phase3_encounter, plausibility
 from agent.planning.exchange import LogPlanner, Steps
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
@@ -25,7 +25,10 @@ class Paper(LogPlanner):
     MANOEUVRES = Manoeuvres(directions=(1.0,), sides=(1.0,), last_speeds=None, fewest_out_of_range=False)
     """Forward, to the left in phase 1, and at v_max."""
     DEAD_RECKONED = Steps(
-        phase1_anchor.unranged, phase1_anchor.as_published, phase2_orbit.continued, phase3_turns.met_on_orbits
+        phase1_anchor.unranged,
+        phase1_anchor.as_published,
+        phase2_orbit.continued,
+        phase3_encounter.met_on_orbits,
     )
     CORRECTED = DEAD_RECKONED._replace(unranged=lambda state: state)
     """A first range may be missing by chance."""
@@ -57,17 +60,17 @@ class Paper(LogPlanner):
         The mutual ranges count from the encounter on. Return `state` with a verdict, with b's last
         manoeuvre, or with the same task.
         """
-        evaluated = phase3_turns.with_new_ticks(state)
+        evaluated = phase3_encounter.with_new_ticks(state)
         if evaluated is None:
             return state
         first_tick, planned = state.belief.encounter_tick, state.plan is not None
         assert first_tick is not None
         a_waits = not isinstance(state.task, Standing) or state.peer_state.state == Waiting.name
         second = a_waits or planned
-        state, estimate = phase3_turns.pair_estimate(evaluated, first_tick, second_range=second)
+        state, estimate = phase3_encounter.pair_estimate(evaluated, first_tick, second_range=second)
         if estimate is None or state.verdict is not None or state.config.role == "a":
             return state
         if planned:
             return state.undecided(estimate.failure)
-        moving = phase3_turns.last_manoeuvre(state, estimate, self.last_manoeuvre)
+        moving = phase3_encounter.last_manoeuvre(state, estimate, self.last_manoeuvre)
         return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")

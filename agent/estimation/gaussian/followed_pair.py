@@ -121,7 +121,7 @@ def _searched(
             pass
         case None:
             attempt = replace(attempt, doubtful_claims=0, p_value=least)
-            verdict = judged.localised
+            verdict = Localised(belief.poses[0], belief.covariance)
         case Blocked(condition, reason) if condition is profiles:
             attempt = replace(attempt, doubtful_claims=attempt.doubtful_claims + 1)
             verdict = Undecided(reason) if attempt.doubtful_claims >= DOUBTFUL_CLAIMS else None

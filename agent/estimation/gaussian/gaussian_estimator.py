@@ -17,7 +17,7 @@ from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.gaussian.own_anchor import followed
 from agent.estimation.gaussian.search import search
 from agent.estimation.knowledge import Knowledge
-from protocol.messages import Observation, Undecided, Verdict
+from protocol.messages import Localised, Observation, Undecided, Verdict
 from protocol.mission import RANGE_MARGIN
 from protocol.motion import Pose, relative, wrap
 
@@ -80,7 +80,7 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         failure = f"the paper's manoeuvres give no further ranges: {belief.blocking_reason}"
         verdict: Verdict | None = Undecided(failure)
         if judged is not None:
-            verdict = judged.localised if blocking is None else None
+            verdict = Localised(belief.poses[0], belief.covariance) if blocking is None else None
         placements = tuple([_pose_in_b_frame(one.fit) for one in belief.pair])
         return PairEstimate(belief, verdict, placements, failure)
 
