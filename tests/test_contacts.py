@@ -14,6 +14,7 @@ from agent.estimation.gaussian.contact_fit import contact_measurements, estimate
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Track, track
 from agent.planning.contacted import Contacted
+from agent.planning.group import GroupPlanner
 from agent.planning.unanchored import UnanchoredPlanner
 from compose.recording.claim_errors import nees
 from protocol.messages import Contact as Detection
@@ -129,7 +130,7 @@ def config() -> RobotConfig:
 
 def met(sigma: float, ticks: int = 40) -> Any:
     """Return the state of a robot after a contact with a finder whose position has this sigma, in m."""
-    planner, pose = UnanchoredPlanner(), Pose(5.0, 4.0, 0.7)
+    planner, pose = GroupPlanner(UnanchoredPlanner()), Pose(5.0, 4.0, 0.7)
     finder, driven = Pose(6.5, 5.0, 0.2), [(v, omega) for v, omega in FINDER * 8]
     state, executed = planner.start(config()), None
     runs: list[Segment] = []
@@ -158,11 +159,11 @@ def test_a_robot_claims_its_pose_in_a_contact() -> None:
     assert isinstance(state.verdict, Localised)
     assert state.verdict.covariance is not None
     assert nees(state.verdict.pose, pose, state.verdict.covariance) < 16.3
-    assert UnanchoredPlanner().report_to(state, "b").heard > 0
+    assert GroupPlanner(UnanchoredPlanner()).report_to(state, "b").heard > 0
 
 
 def test_a_robot_stands_still_for_a_finder_that_is_too_inaccurate_and_ends_undecided() -> None:
-    planner = UnanchoredPlanner()
+    planner = GroupPlanner(UnanchoredPlanner())
     state, _ = met(0.4)
     assert state.odometry == Pose(0.0, 0.0, 0.0)
     late = math.ceil(state.config.gives_up / state.config.mission.period)
@@ -172,7 +173,7 @@ def test_a_robot_stands_still_for_a_finder_that_is_too_inaccurate_and_ends_undec
 
 
 def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_in_three_ticks() -> None:
-    planner = UnanchoredPlanner()
+    planner = GroupPlanner(UnanchoredPlanner())
     state = planner.start(config())
     covariance = Covariance(0.01, 0.0, 0.0, 0.01, 0.0, 1e-4)
     estimates = set()

@@ -393,7 +393,7 @@ def test_visitors_sweep_and_the_robots_that_they_have_visited_are_their_beacons(
 
 
 def test_malformed_references_are_refused() -> None:
-    planner = UnanchoredPlanner()
+    planner = GroupPlanner(UnanchoredPlanner())
     good = decode(encode(references(of_frames(journals()))[0][1]), Report)
     assert good.prior is not None
     assert planner.malformed(good) is None

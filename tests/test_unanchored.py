@@ -17,6 +17,7 @@ from msgspec.structs import replace
 from playwright.sync_api import expect
 
 from agent.planning.agenda import Agenda
+from agent.planning.group import GroupPlanner
 from agent.planning.state import RobotState
 from agent.planning.sweep import second_half, strips, without_strips
 from agent.planning.tasks import Looping, Sweeping
@@ -208,7 +209,7 @@ def test_lost_and_late_reports_only_cost_time(fault: dict[str, Any]) -> None:
 
 def test_reports_in_another_order_lead_to_the_same_claim_to_the_bit() -> None:
     agent = of_frames(kept(scenario_of(four()))).agents["u"]
-    planner = UnanchoredPlanner()
+    planner = GroupPlanner(UnanchoredPlanner())
     observed = planner.start(agent.config)
     reports: list[Report] = []
     for one_step in agent.steps:
@@ -229,7 +230,7 @@ def test_reports_in_another_order_lead_to_the_same_claim_to_the_bit() -> None:
 def test_a_robot_that_a_passing_one_has_left_on_a_square_is_localised_by_the_next_one() -> None:
     """The odometry of the robot then differs from where it stood first, by rounding."""
     scenario = scenario_of(four())
-    config, planner = scenario.config("u"), UnanchoredPlanner()
+    config, planner = scenario.config("u"), GroupPlanner(UnanchoredPlanner())
     pose, state, tick = Pose(5.0, 4.0, 0.7), planner.start(config), 0
     driven: Controls | None = None
     square = [(0.0, 0.0), (0.5, 0.0), (0.5, 0.5), (0.0, 0.5)]

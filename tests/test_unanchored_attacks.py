@@ -10,6 +10,7 @@ from typing import Any
 import pytest
 from msgspec.structs import replace
 
+from agent.planning.group import GroupPlanner
 from agent.planning.state import RobotState
 from agent.planning.tasks import Travelling
 from agent.planning.unanchored import UnanchoredPlanner
@@ -247,7 +248,7 @@ def met(state: RobotState, pose: Pose, finder: str, offset: Pose) -> tuple[Robot
 
     The finder reports its poses as they are after the motion `offset` of the plane.
     """
-    planner = UnanchoredPlanner()
+    planner = GroupPlanner(UnanchoredPlanner())
     for corner in range(40):
         dx, dy = [(0.0, 0.0), (0.1, 0.0), (0.1, 0.1), (0.0, 0.1)][corner % 4]
         place, tick = Pose(6.0 + dx, 5.0 + dy, 0.0), state.tick + 1
@@ -267,7 +268,7 @@ def met(state: RobotState, pose: Pose, finder: str, offset: Pose) -> tuple[Robot
 
 
 def test_a_pose_is_claimed_when_one_more_finder_than_may_lie_agrees_on_it() -> None:
-    planner = UnanchoredPlanner()
+    planner = GroupPlanner(UnanchoredPlanner())
     config = scenario_of(five()).config("u")
     pose = Pose(5.0, 4.0, 0.7)
     state, pose = met(planner.start(config), pose, "a", Pose(0.4, -0.2, 0.3))

@@ -46,7 +46,10 @@ from protocol.motion import Controls, compose
 
 
 class GroupPlanner(Planner[RobotState, Report]):
-    """The planner of a robot in a group, which leaves each meeting to the planner of a pair."""
+    """The planner of a robot in a group, which leaves each meeting to the planner of a pair.
+
+    A robot without an anchor has one meeting, in which it is found (`unanchored`).
+    """
 
     BODY = Report
 
@@ -83,6 +86,8 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
+        if (found := state.agenda.found) is not None and not searching.takes_part(state):
+            return found.answered(exchange.report_without_log(state, state.agenda.robot_verdict), peer)
         if searching.is_helped(state, peer):
             return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):
@@ -96,6 +101,8 @@ class GroupPlanner(Planner[RobotState, Report]):
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
+        if state.agenda.found is not None:
+            return self.pair_planner.decide(state, reports)
         if searching.is_apart(state):
             return _apart(state, reports)
         state = self._met(state, reports)

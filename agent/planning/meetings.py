@@ -151,7 +151,7 @@ def rests(state: RobotState) -> bool:
     """Return whether the robot has its result, its meeting is over, and it has no robot to drive to."""
     if state.agenda.robot_verdict is None or not isinstance(state.task, Done) or _must_linger(state):
         return False
-    return _is_over(state)
+    return state.agenda.alone or _is_over(state)
 
 
 def _must_linger(state: RobotState) -> bool:

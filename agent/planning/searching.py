@@ -47,6 +47,11 @@ def is_helped(state: RobotState, robot: str) -> bool:
     return robot in state.config.unanchored and not finished
 
 
+def takes_part(state: RobotState) -> bool:
+    """Return whether a robot without an anchor is localised, and looks for the others that have none."""
+    return isinstance(state.agenda.robot_verdict, Localised) and sweep.shares(state)
+
+
 def has_beacon(state: RobotState) -> bool:
     """Return whether the robot sweeps with its latest peer as a beacon, which goes on to get its log."""
     return state.sweeps and sweep.reports_covariance(state)

@@ -14,46 +14,32 @@ from msgspec.structs import replace
 from agent.estimation.claim import is_definite
 from agent.estimation.compiled import library
 from agent.estimation.judged import sufficient_mutual_ranges
-from agent.peer import peer_state
-from agent.planning import drive, exchange, meetings, searching, sweep
+from agent.planning import meetings, searching, sweep
 from agent.planning.contacted import Contacted
-from agent.planning.planner import Planner, Summary
+from agent.planning.exchange import LogPlanner
+from agent.planning.planner import Summary
 from agent.planning.resected import Resected
 from agent.planning.state import RobotState
 from agent.planning.tasks import Awaiting, Done, Sweeping
-from protocol.messages import Command, Estimate, Localised, Observation, Report, RobotConfig
+from protocol.messages import Estimate, Localised, Report, RobotConfig
 from protocol.mission import Mission
 
 FEWEST_PLACES = 5
 """The number of relative placements that a claim needs: three for a position, two for a heading."""
 
 
-class UnanchoredPlanner(Planner[RobotState, Report]):
-    """The planner of a robot without an anchor."""
+class UnanchoredPlanner(LogPlanner):
+    """The planner of a robot without an anchor, in whose one meeting `GroupPlanner` lets it decide."""
 
-    BODY = Report
     REQUIRED_PLACES = FEWEST_PLACES
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
         state = RobotState(config, task=Awaiting())
         if not sweep.reports_covariance(state):
-            return state.with_agenda(found=Resected())
+            return state.with_agenda(found=Resected(), alone=True)
         library()  # it is needed when the robot is found, and would end the mission then
-        return state.with_agenda(found=Contacted())
-
-    def observe(self, state: RobotState, observation: Observation) -> RobotState:
-        """Return `state` with the odometry and the ranges of one tick."""
-        return exchange.observed(state, observation)
-
-    def report_to(self, state: RobotState, peer: str) -> Report:
-        """Return the report to `peer`, without a log, as this robot is in no meeting.
-
-        Once localised, it has the pose for others without an anchor.
-        """
-        if _searches(state):
-            return searching.outside_meeting(state, peer)
-        return _found(state).answered(exchange.report_without_log(state, state.agenda.robot_verdict), peer)
+        return state.with_agenda(found=Contacted(), alone=True)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose.
@@ -65,23 +51,12 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
             found = _found(state)
             state = state.undecided(found.why_undecided(state)) if late else found.told(state, reports)
             state = state if state.verdict is None else state.with_agenda(robot_verdict=state.verdict)
-        return _searching(state, reports) if _searches(state) else state
-
-    def command(self, state: RobotState) -> Command:
-        """Return the command for the next tick, with the phase, the task and the verdict."""
-        command = exchange.command(state, drive.controls(state))
-        return replace(command, peer=None, role=None, verdict=state.agenda.robot_verdict)
+        return _searching(state, reports) if searching.takes_part(state) else state
 
     def estimate(self, state: RobotState) -> Estimate:
         """Return the possible poses in <W>."""
-        estimate = Estimate(
-            tick=state.tick,
-            robot=state.config.robot,
-            local=(),
-            world=(),
-            localised=isinstance(state.agenda.robot_verdict, Localised),
-        )
-        return _found(state).estimate(state, estimate)
+        localised = isinstance(state.agenda.robot_verdict, Localised)
+        return _found(state).estimate(state, replace(super().estimate(state), localised=localised))
 
     # --- optional ---
 
@@ -92,7 +67,7 @@ class UnanchoredPlanner(Planner[RobotState, Report]):
                 return f"a log from tick {body.since} on, before its pose at tick {prior.tick}"
             if not is_definite(np.array(prior.covariance.matrix)):
                 return "a covariance of a pose that is not positive definite"
-        return peer_state.contradiction(body)
+        return super().malformed(body)
 
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
@@ -107,11 +82,6 @@ def _found(state: RobotState) -> Resected | Contacted:
     """Return what a robot without an anchor knows by others."""
     assert state.agenda.found is not None
     return state.agenda.found
-
-
-def _searches(state: RobotState) -> bool:
-    """Return whether the robot is localised and looks for others that have no anchor."""
-    return isinstance(state.agenda.robot_verdict, Localised) and sweep.shares(state)
 
 
 def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:

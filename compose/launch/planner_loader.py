@@ -75,7 +75,7 @@ def unguarded_planner_of(config: RobotConfig) -> Planner[Any, Any]:
     from agent.planning.unanchored import UnanchoredPlanner  # noqa: PLC0415  # likewise
 
     if config.given_anchor is None:
-        return UnanchoredPlanner()
+        return GroupPlanner(UnanchoredPlanner())
     if isinstance(found, Assured):
         return GroupPlanner(found)
     if not meets(type(found)):
