@@ -9,8 +9,6 @@ from functools import cache
 from statistics import median
 from typing import Any
 
-from msgspec.structs import replace
-
 import tandem
 from agent.process.robot import Robot
 from compose.launch import in_process
@@ -18,8 +16,6 @@ from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
 from compose.scenario import scenario_file
 from compose.sweep.trial_mission import run_in_process
-from protocol.noise import Noise
-from protocol.orbits import rendezvous, tick_budget
 from world.scenario import Scenario
 from world.simulation import Simulation
 
@@ -36,10 +32,10 @@ BY_API = {"random": 50, "noisy": 5}
 @cache
 def random_missions(count: int, sigma: float = 0.0) -> list[Scenario]:
     """Return the first `count` random missions, with ranges of `sigma` m."""
-    exact = [scenario_file.load("random", seed=FIRST_SEED + i) for i in range(count)]
-    return (
-        [_with_noise(one, Noise(anchor_sigma=sigma, mutual_sigma=sigma)) for one in exact] if sigma else exact
-    )
+    table = scenario_file.scenario_table("random")
+    table["mission"]["noise"] = {"anchor_sigma": sigma, "mutual_sigma": sigma}
+    template = scenario_file.validate(table, "random")
+    return [template.seeded(FIRST_SEED + i) for i in range(count)]
 
 
 def seconds(work: Callable[[Any], object], over: Sequence[Any]) -> float:
@@ -131,15 +127,6 @@ def _parts(scenarios: Sequence[Scenario]) -> tuple[float, float, float]:
             sensing += observed - sensed
             deciding += decided - observed
     return sensing, deciding, world
-
-
-def _with_noise(exact: Scenario, noise: Noise) -> Scenario:
-    """Return `exact` with `noise`, and with the orbits and the tick budget that follow from it."""
-    mission = replace(exact.mission, noise=noise)
-    first, second = (robot.anchor for robot in exact.robots)
-    plan = rendezvous(mission, math.dist((first.x, first.y), (second.x, second.y)), exact.planner_name)
-    robots = tuple([replace(robot, rendezvous=plan) for robot in exact.robots])
-    return replace(exact, mission=mission, robots=robots, max_ticks=tick_budget(mission, plan))
 
 
 def groups(_: int) -> dict[str, float]:
