@@ -63,6 +63,8 @@ SIGNATURES = {
     "detections": (ctypes.c_int, "anaannaaadana"),
     "same_poses": (None, "naaadda"),
     "placements": (TYPES["n"], "nnaaaaaaaaaaanannaaddndddna"),
+    "own_costs": (None, "annaanaaaaa"),
+    "joint_costs": (ctypes.c_int, "annaannnaaaaa"),
 }
 """The results and the arguments of the functions of C: numbers (n), floats (d), addresses of arrays (a)."""
 ALLOCATING = ("anchor_guesses", "detections", "fitted", "gauss_newton_step", "placements")

@@ -1,5 +1,5 @@
 /* `track` of odometry_noise.py, the initial guesses of anchor_guesses.py and placement_guesses.py, the likelihood of
-   detections.py, and `same` of posterior.py. These explain them, and have the constants.
+   detections.py, `same` of posterior.py, and the costs of active_sensing.py. These explain them, and have the constants.
 
    Sums over ranges are those of numpy (`summed`), so that the results are the same to the bit. */
 
@@ -600,4 +600,147 @@ void same_poses(Index robots, const double *one, const double *other, const doub
         }
         found[i / 3] = squared < most;
     }
+}
+
+/* --- the costs of manoeuvres ------------------------------------------------------------------------------- */
+
+/* What costs depend on, besides the hypotheses: lengths (m), the sigma of ranges (m) and `own` of those to anchors, which
+   is a variance for a robot alone, the squared accuracy, and costs per m. */
+typedef struct {
+    double reach, sigma, own, accuracy, far_predicted, gap_sigma, largest_gap, confused;
+    double farthest, nearest, nearest_to_anchor, outside, near, standing;
+} Weighed;
+
+/* The positions (m) after each of the strides from `pose`. */
+static void ends_of(const double *pose, Index strides, const double *along, const double *across, double *x, double *y)
+{
+    const double c = cos(pose[2]), s = sin(pose[2]);
+    for (Index t = 0; t < strides; t++) {
+        x[t] = pose[0] + c * along[t] - s * across[t];
+        y[t] = pose[1] + s * along[t] + c * across[t];
+    }
+}
+
+/* The expected cost of confusing the first hypothesis with another, by the predicted distances (m) of each. */
+static double confusion(const Weighed *by, Index hypotheses, const double *probability, Index strides,
+                        const double *distance)
+{
+    double remaining = 0.0, gaps[strides];
+    for (Index h = 1; h < hypotheses; h++) {
+        for (Index t = 0; t < strides; t++) {
+            const double one = distance[h * strides + t], first = distance[t], most = by->far_predicted;
+            const double gap = ((one < most ? one : most) - (first < most ? first : most)) / by->gap_sigma;
+            gaps[t] = gap * gap;
+        }
+        const double gap = summed(gaps, strides);
+        remaining += sqrt(probability[0] * probability[h]) * exp(-(gap < by->largest_gap ? gap : by->largest_gap) / 8.0);
+    }
+    return by->confused * remaining;
+}
+
+/* Set the costs of `count` manoeuvres of a robot about its anchor, the last of which is to stand; `margins` are those
+   (m) within the largest allowed distance, and `information` is that on the position. */
+void own_costs(const Weighed *by, Index count, Index strides, const double *along, const double *across,
+               Index hypotheses, const double *probability, const double *poses, const double *margins,
+               const double *information, double *cost)
+{
+    double x[strides], y[strides], distance[hypotheses * strides], terms[3][strides];
+    for (Index n = 0; n < count; n++) {
+        for (Index h = hypotheses - 1; h >= 0; h--) {
+            ends_of(poses + 3 * h, strides, along + n * strides, across + n * strides, x, y);
+            for (Index t = 0; t < strides; t++)
+                distance[h * strides + t] = larger(length(x[t], y[t]), SIGMA_FLOOR);
+        }
+        for (Index t = 0; t < strides; t++) {
+            const double ux = x[t] / distance[t], uy = y[t] / distance[t];
+            const double weight = (distance[t] <= by->reach) / by->own;
+            terms[0][t] = weight * ux * ux;
+            terms[1][t] = weight * ux * uy;
+            terms[2][t] = weight * uy * uy;
+        }
+        const double xx = information[0] + summed(terms[0], strides), xy = information[1] + summed(terms[1], strides);
+        const double yy = information[3] + summed(terms[2], strides);
+        cost[n] = (xx + yy) / larger(xx * yy - xy * xy, 1e-300) / by->accuracy;
+        cost[n] += confusion(by, hypotheses, probability, strides, distance);
+        if (n == count - 1) cost[n] += by->standing;
+        for (Index h = 0; h < hypotheses; h++) {
+            const double away = distance[h * strides];
+            cost[n] += probability[h] * by->near * larger(0.0, by->nearest_to_anchor - away);
+            cost[n] += probability[h] * by->outside * larger(0.0, away + margins[h] - by->farthest);
+        }
+    }
+}
+
+/* Add the cost of the variance of both positions after ranges of a and b, which drive to x and y (m); returns 0 if the
+   information is singular. `anchors` are the places (m) of their anchors, and `distance` those (m) between them. */
+static int add_variance(const Weighed *by, Index strides, const double *pose, const double *x, const double *y,
+                       const double *distance, const double *anchors, const double *information, double *cost)
+{
+    double rows[3 * strides][6], after[36] = {0.0}, identity[36] = {0.0};
+    memset(rows, 0, sizeof rows);
+    for (Index t = 0; t < strides; t++) {
+        const double nx = (x[t] - x[strides + t]) / distance[t], ny = (y[t] - y[strides + t]) / distance[t];
+        const double weight = (distance[t] <= by->reach) / by->sigma;
+        for (int i = 0; i < 2; i++) {
+            const double sign = i ? -1.0 : 1.0, at_x = x[i * strides + t], at_y = y[i * strides + t];
+            const double lx = at_x - pose[3 * i], ly = at_y - pose[3 * i + 1];
+            const double ox = at_x - anchors[2 * i], oy = at_y - anchors[2 * i + 1];
+            const double rho = larger(length(ox, oy), SIGMA_FLOOR), own = (rho <= by->reach) / rho / by->own;
+            double *mutual = rows[t] + 3 * i, *to_anchor = rows[(i + 1) * strides + t] + 3 * i;
+            mutual[0] = sign * nx * weight;
+            mutual[1] = sign * ny * weight;
+            mutual[2] = sign * (ny * lx - nx * ly) * weight;
+            to_anchor[0] = ox * own;
+            to_anchor[1] = oy * own;
+            to_anchor[2] = (oy * lx - ox * ly) * own;
+        }
+    }
+    for (Index a = 0; a < 6; a++) {
+        for (Index t = 0; t < 3 * strides; t++)
+            for (Index b = 0; b < 6; b++) after[6 * a + b] += rows[t][a] * rows[t][b];
+        for (Index b = 0; b < 6; b++) after[6 * a + b] = information[6 * a + b] + after[6 * a + b];
+        identity[7 * a] = 1.0;
+    }
+    if (!solutions(1, 6, 6, after, identity)) return 0;
+    for (int i = 0; i < 2; i++) {
+        const double *own = identity + 21 * i, dx = x[(i + 1) * strides - 1] - pose[3 * i];
+        const double dy = y[(i + 1) * strides - 1] - pose[3 * i + 1];
+        double variance = own[0] + own[7];
+        variance += (dx * dx + dy * dy) * own[14];
+        variance += 2.0 * (dx * own[8] - dy * own[2]);
+        *cost += variance / by->accuracy;
+    }
+    return 1;
+}
+
+/* Set the costs of `count` manoeuvres of the robot `moving` (0 or 1) while the other one executes the one with the index
+   `other`. Returns 0 if a matrix is singular. */
+int joint_costs(const Weighed *by, Index count, Index strides, const double *along, const double *across, Index moving,
+                Index other, Index hypotheses, const double *probability, const double *poses, const double *anchors,
+                const double *information, double *cost)
+{
+    double x[2 * strides], y[2 * strides], distances[hypotheses * strides];
+    for (Index n = 0; n < count; n++) {
+        cost[n] = 0.0;
+        for (Index h = 0; h < hypotheses; h++) {
+            double *distance = distances + h * strides, least = INFINITY;
+            for (Index i = 0; i < 2; i++) {
+                const Index way = strides * (i == moving ? n : other);
+                ends_of(poses + 6 * h + 3 * i, strides, along + way, across + way, x + i * strides, y + i * strides);
+            }
+            for (Index t = 0; t < strides; t++) {
+                distance[t] = larger(length(x[t] - x[strides + t], y[t] - y[strides + t]), SIGMA_FLOOR);
+                least = distance[t] < least ? distance[t] : least;
+            }
+            const double off_anchor = length(x[strides] - anchors[2], y[strides] - anchors[3]);
+            cost[n] += probability[h] * by->outside * larger(0.0, distance[0] - by->farthest);
+            cost[n] += probability[h] * by->outside * larger(0.0, off_anchor - by->farthest);
+            cost[n] += probability[h] * by->near * larger(0.0, by->nearest - least);
+            cost[n] += probability[h] * by->near * larger(0.0, by->nearest_to_anchor - off_anchor);
+            if (!h && !add_variance(by, strides, poses, x, y, distance, anchors, information, cost + n)) return 0;
+        }
+        cost[n] += confusion(by, hypotheses, probability, strides, distances);
+    }
+    cost[count - 1] += by->standing;
+    return 1;
 }

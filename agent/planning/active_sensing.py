@@ -7,18 +7,21 @@ variance of the positions.
 
 from __future__ import annotations
 
+import ctypes
 import math
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.estimation.compiled import address, library
 from agent.estimation.elementary import eigh, exp, hypot, inverted, product
 from agent.estimation.gaussian.odometry_noise import Array, Places, Track
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
+from agent.estimation.smoother import Singular
 from agent.planning import separation
 from agent.planning.state import RobotState
 from agent.planning.strides import STRIDES_AHEAD, Choice, choice, is_stalled, stride
@@ -88,31 +91,41 @@ def plan_alone(
     is the largest allowed distance from the anchor in m. The `outside_cost` of the objective does not count:
     that of a robot alone is OUTSIDE_COST_ALONE, or OUTSIDE_COST beyond `within`.
     """
-    ways = choice(mission, objective.strides)
-    best = hypotheses[0]
-    reach = mission.sensing_range
-    distances = []
-    for one in hypotheses:
-        x, y = ways.ends(one.poses)
-        distances.append(np.maximum(hypot(x, y), SIGMA_FLOOR))
-        if one is best:
-            ux, uy = x / distances[0], y / distances[0]
+    ways, reach = choice(mission, objective.strides), mission.sensing_range
     sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
-    weight = (distances[0] <= reach) / sigma**2
-    information = _information(best.covariance, mission)
-    xx = information[0, 0] + np.sum(weight * ux * ux, 1)
-    xy = information[0, 1] + np.sum(weight * ux * uy, 1)
-    yy = information[1, 1] + np.sum(weight * uy * uy, 1)
-    cost = (xx + yy) / np.maximum(xx * yy - xy * xy, 1e-300) / mission.accuracy**2
-    cost += _confusion(hypotheses, distances, sigma, reach)
-    cost[-1] += objective.standing_cost
-    limit = within if within is not None else reach
-    for one, distance in zip(hypotheses, distances, strict=True):
-        cost += one.probability * OUTSIDE_COST * np.maximum(0.0, NEAREST_TO_ANCHOR * reach - distance[:, 0])
-        margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
-        loss = OUTSIDE_COST if within is not None else OUTSIDE_COST_ALONE
-        cost += one.probability * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
+    margins, loss, limit = np.zeros(len(hypotheses)), OUTSIDE_COST, within
+    if limit is None:
+        sigmas = [math.sqrt(max(0.0, float(np.trace(one.covariance)))) for one in hypotheses]
+        margins, loss, limit = np.minimum(sigmas, 0.1 * reach), OUTSIDE_COST_ALONE, reach
+    by = _weighed(mission, sigma, sigma**2, limit, loss, objective.standing_cost)
+    information, cost = _information(hypotheses[0].covariance, mission), np.empty(len(ways.v))
+    library().own_costs(
+        *(by, *_ways(ways), *_poses(hypotheses)),
+        *map(address, (margins, information, cost)),
+    )
     return ways.controls(int(np.argmin(cost)))
+
+
+def _weighed(
+    mission: Mission, sigma: float, own: float, farthest: float, outside: float, standing: float
+) -> ctypes.Array[ctypes.c_char]:
+    """Return `Weighed` of hypotheses.c; `own` is as there."""
+    reach = mission.sensing_range
+    of_confusion = (FARTHEST_PREDICTION * reach, SIGMA_FACTOR * sigma, LARGEST_GAP, CONFUSION_COST)
+    lengths = (farthest, NEAREST * reach, NEAREST_TO_ANCHOR * reach)
+    costs = (outside, OUTSIDE_COST, standing)
+    return address(np.array((reach, sigma, own, mission.accuracy**2, *of_confusion, *lengths, *costs)))
+
+
+def _ways(ways: Choice) -> tuple[Any, ...]:
+    """Return the manoeuvres as arguments of hypotheses.c."""
+    return (*ways.along.shape, address(ways.along), address(ways.across))
+
+
+def _poses(hypotheses: Sequence[PlanningHypothesis]) -> tuple[Any, ...]:
+    """Return the number of hypotheses, their probabilities and their poses as arguments of hypotheses.c."""
+    poses = np.concatenate([one.poses for one in hypotheses])
+    return len(hypotheses), address(np.array([one.probability for one in hypotheses])), address(poses)
 
 
 @lru_cache(maxsize=2)  # both robots of one process ask for it
@@ -135,77 +148,48 @@ def plan_together(
     for b; for a only if b is resting.
     """
     ways = choice(mission, objective.strides)
-    stand = len(ways.v) - 1
-    still, every = np.array([stand]), np.arange(stand + 1)
-    a = b = stand
+    a = b = stand = len(ways.v) - 1
+    given = (hypotheses, m2, rho, mission, _information(hypotheses[0].covariance, mission))
     if resting != "b":
-        _, b = _best_of(ways, hypotheses, m2, rho, mission, still, every, objective)
+        b = _best_of(ways, 1, stand, *given, objective)
     if resting != "a":
         of_a = objective if resting == "b" else objective._replace(standing_cost=0.0)
-        a, _ = _best_of(ways, hypotheses, m2, rho, mission, every, np.array([b]), of_a)
+        a = _best_of(ways, 0, b, *given, of_a)
     return ways.controls(a), ways.controls(b)
 
 
 def _best_of(
     ways: Choice,
+    moving: int,
+    other: int,
     hypotheses: Sequence[PlanningHypothesis],
     m2: tuple[float, float],
     latest: float,
     mission: Mission,
-    of_a: Places,
-    of_b: Places,
+    information: Array,
     objective: Objective,
-) -> tuple[int, int]:
-    """Return the best pair of manoeuvres from `of_a` and `of_b`, one of which contains a single manoeuvre.
+) -> int:
+    """Return the best manoeuvre of a robot (0 or 1) while the other one executes that with the index `other`.
 
-    In the last pair, the robot that has several manoeuvres stands still.
+    The last manoeuvre is to stand. `information` is that on both poses, and `latest` the latest range (m).
     """
-    reach = mission.sensing_range
     own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
-    anchors = ((0.0, 0.0), m2)
-    count = max(len(of_a), len(of_b))
-    distances = []
-    cost = np.zeros(count)
-    for one in hypotheses:
-        ax, ay = ways.ends(one.poses[:3], of_a)
-        bx, by = ways.ends(one.poses[3:], of_b)
-        dx, dy = ax - bx, ay - by
-        distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
-        distances.append(distance)
-        off_anchor = hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
-        for beyond, loss in (
-            (distance[:, 0] - FARTHEST_PLANNED * reach, objective.outside_cost),
-            (off_anchor - FARTHEST_PLANNED * reach, objective.outside_cost),
-            (NEAREST * reach - np.min(distance, 1), OUTSIDE_COST),
-            (NEAREST_TO_ANCHOR * reach - off_anchor, OUTSIDE_COST),
-        ):
-            cost += one.probability * loss * np.maximum(0.0, beyond)
-        if one is not hypotheses[0]:
-            continue
-        ahead = distance.shape[1]
-        rows = np.zeros((count, 3 * ahead, 6))
-        nx, ny = dx / distance, dy / distance
-        weight = (distance <= reach) / sigma
-        for robot, (x, y), sign in ((0, (ax, ay), 1.0), (1, (bx, by), -1.0)):
-            moved = x - one.poses[3 * robot], y - one.poses[3 * robot + 1]
-            ox, oy = x - anchors[robot][0], y - anchors[robot][1]
-            rho = np.maximum(hypot(ox, oy), SIGMA_FLOOR)
-            own, own_rows = (rho <= reach) / rho / own_sigma, slice((robot + 1) * ahead, (robot + 2) * ahead)
-            effects = zip(_effects(nx, ny, *moved), _effects(ox, oy, *moved), strict=True)
-            for i, (of_mutual, of_own) in enumerate(effects, 3 * robot):
-                rows[:, :ahead, i], rows[:, own_rows, i] = sign * of_mutual * weight, of_own * own
-        after = _after(one.covariance, rows, mission)
-        for i, (x, y) in ((0, (ax, ay)), (3, (bx, by))):
-            variance = _position_variance(after, i, x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1])
-            cost += variance / mission.accuracy**2
-    cost += _confusion(hypotheses, distances, sigma, reach)
-    cost[-1] += objective.standing_cost
+    farthest, outside = FARTHEST_PLANNED * mission.sensing_range, objective.outside_cost
+    by = _weighed(mission, sigma, own_sigma, farthest, outside, objective.standing_cost)
+    anchors, cost = np.array((0.0, 0.0, *m2)), np.empty(len(ways.v))
+    found = library().joint_costs(
+        *(by, *_ways(ways), moving, other, *_poses(hypotheses)),
+        *map(address, (anchors, information, cost)),
+    )
+    if not found:
+        raise Singular("the information on the poses is singular")
     if mission.safety_distance:
+        every, given = np.arange(len(cost)), np.array([other])
+        of_a, of_b = (given, every) if moving else (every, given)
         cost[~_keep_apart(ways, hypotheses, latest, mission, of_a, of_b)] = np.inf
         cost[-1] = min(cost[-1], STANDING_COST)
-    i = int(np.argmin(cost))
-    return int(of_a[i if len(of_a) > 1 else 0]), int(of_b[i if len(of_b) > 1 else 0])
+    return int(np.argmin(cost))
 
 
 def _keep_apart(
