@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -45,7 +46,7 @@ def followed(knowledge: Knowledge) -> FollowedPair:
     converge, and before a claim or a suspicion.
     """
     first = beginning(knowledge, knowledge.known_through)
-    measured, belief = pair_of(knowledge), knowledge.belief
+    measured, belief = _shared(pair_of(knowledge)), knowledge.belief
     if first != belief.attempt.beginning:
         belief = replace(belief, pair=(), candidates=None, attempt=Attempt(first))
         knowledge = replace(knowledge, belief=belief)
@@ -60,6 +61,12 @@ def followed(knowledge: Knowledge) -> FollowedPair:
         if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
             return FollowedPair(measured, belief, tuple(map(planning_hypothesis, belief.pair)))
     return _searched(knowledge, measured, search(measured, known), mutual)
+
+
+@lru_cache(maxsize=2)
+def _shared(measured: JointMeasurements) -> JointMeasurements:
+    """Return `measured`, or the same that the other robot of one process has, with what follows from them."""
+    return measured
 
 
 def believed(
