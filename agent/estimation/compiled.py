@@ -63,6 +63,7 @@ SIGNATURES = {
     "detections": (ctypes.c_int, "anaannaaadana"),
     "same_poses": (None, "naaadda"),
     "placements": (TYPES["n"], "nnaaaaaaaaaaanannaaddndddna"),
+    "second_order": (None, "aaa"),
     "own_costs": (None, "annaanaaaaa"),
     "joint_costs": (ctypes.c_int, "annaannnaaaaa"),
 }

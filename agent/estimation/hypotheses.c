@@ -13,6 +13,8 @@ typedef long long Index;
 #define SIZED static inline __attribute__((always_inline))
 
 int solutions(Index count, Index size, Index columns, double *matrix, double *right);
+void products(Index count, Index p, Index q, Index r, const double *left, Index left_step, const double *right,
+              Index right_step, double *to);
 void eigen(Index size, double *matrix, double *vectors);
 
 #define SIGMA_FLOOR 1e-6
@@ -600,6 +602,48 @@ void same_poses(Index robots, const double *one, const double *other, const doub
         }
         found[i / 3] = squared < most;
     }
+}
+
+/* --- poses to second order ----------------------------------------------------------------------------------- */
+
+/* Add to the mean and the covariance of the poses of a and b what ranges and bearings of second order add. `seen` has x, y,
+   the range (m) and its square of b from M2, and those of a from b. */
+void second_order(const double *seen, double *mean, double *covariance)
+{
+    double rows[24] = {0.0}, columns[24], by_rows[24], polar[16], second[96] = {0.0}, curved[96], turned[96], more[36];
+    for (Index k = 0; k < 4; k += 2, seen += 4) {
+        const double x = seen[0], y = seen[1], rho = seen[2], squared = seen[3];
+        const double by[2][2] = {{x / rho, y / rho}, {-y / squared, x / squared}};
+        for (Index row = k; row < k + 2; row++)
+            for (Index a = 0; a < 2; a++) {
+                rows[6 * row + (k ? 0 : 3) + a] = by[row - k][a];
+                if (k) rows[6 * row + 3 + a] = -by[row - k][a];
+            }
+        for (Index i = 0; i <= (k ? 0 : 3); i += 3) {
+            double *of_x = second + 16 * i, *of_y = of_x + 16;
+            of_x[5 * (k + 1)] = -x;
+            of_y[5 * (k + 1)] = -y;
+            of_x[4 * k + k + 1] = of_x[4 * (k + 1) + k] = -y / rho;
+            of_y[4 * k + k + 1] = of_y[4 * (k + 1) + k] = x / rho;
+        }
+    }
+    for (Index e = 0; e < 24; e++) columns[e % 6 * 4 + e / 6] = rows[e];
+    products(1, 4, 6, 6, rows, 0, covariance, 0, by_rows);
+    products(1, 4, 6, 4, by_rows, 0, columns, 0, polar);
+    double scale[4] = {1.0, 1.0, 1.0, 1.0};
+    for (Index k = 1; k < 4; k += 2) { /* the expansion holds for small angles only */
+        const double least = 1.0 / sqrt(polar[5 * k] < 1e-300 ? 1e-300 : polar[5 * k]);
+        scale[k] = least < 1.0 ? least : 1.0;
+    }
+    for (Index e = 0; e < 16; e++) polar[e] = polar[e] * scale[e / 4] * scale[e % 4];
+    products(6, 4, 4, 4, second, 16, polar, 0, curved);
+    for (Index a = 0; a < 6; a++) {
+        const double *own = curved + 16 * a;
+        mean[a] += 0.5 * (own[0] + own[5] + own[10] + own[15]);
+        for (Index e = 0; e < 16; e++) turned[6 * (e % 4 * 4 + e / 4) + a] = own[e];
+    }
+    products(1, 6, 16, 6, curved, 0, turned, 0, more);
+    for (Index e = 0; e < 36; e++) covariance[e] = covariance[e] + 0.5 * more[e];
 }
 
 /* --- the costs of manoeuvres ------------------------------------------------------------------------------- */

@@ -360,8 +360,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         """Return the measurements of one robot near its anchor, which is the origin.
 
         One anchor does not tell the heading at tick 0: it is held at 0, so the axes are those of the
-        odometry. Where the anchor should be does not matter, so there is no surveying error. These measurements
-        keep those of each robot, with their problem.
+        odometry. Where the anchor should be does not matter, so there is no surveying error.
+        Those of each robot are kept, with their problem.
         """
         known: dict[int, JointMeasurements] = self.__dict__.setdefault("of_each", {})
         if robot not in known:

@@ -8,7 +8,7 @@ from functools import lru_cache
 import msgspec
 import numpy as np
 
-from agent.estimation.elementary import product
+from agent.estimation.compiled import address, library
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.placement_guesses import STARTS
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
@@ -60,39 +60,10 @@ def to_second_order(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> 
     Both are computed to second order. If ranges are much more accurate than bearings, the possible positions
     form an arc, which a first-order ellipse does not cover. `m2` is the position of M2 relative to M1.
     """
-    mean, covariance = hypothesis.poses.copy(), hypothesis.covariance
+    mean, covariance = hypothesis.poses.copy(), np.array(hypothesis.covariance, order="C")
     bx, by = mean[3] - m2[0], mean[4] - m2[1]
     ax, ay = mean[0] - mean[3], mean[1] - mean[4]
-    # gradients of range and bearing of b, then of a from b, with respect to the poses
-    rows = np.zeros((4, 6))
-    for k, (x, y), plus, minus in ((0, (bx, by), 3, None), (2, (ax, ay), 0, 3)):
-        rho = max(math.hypot(x, y), SIGMA_FLOOR)
-        for row, (gx, gy) in ((k, (x / rho, y / rho)), (k + 1, (-y / rho**2, x / rho**2))):
-            rows[row, plus : plus + 2] = gx, gy
-            if minus is not None:
-                rows[row, minus : minus + 2] = -gx, -gy
-    polar = product(product(rows, covariance), rows.T)
-    polar = _limited(polar)
-    second = np.zeros((6, 4, 4))
-    for k, (x, y), moved in ((0, (bx, by), (0, 3)), (2, (ax, ay), (0,))):
-        rho = max(math.hypot(x, y), SIGMA_FLOOR)
-        for i in moved:
-            second[i, k + 1, k + 1] = -x
-            second[i + 1, k + 1, k + 1] = -y
-            second[i, k, k + 1] = second[i, k + 1, k] = -y / rho
-            second[i + 1, k, k + 1] = second[i + 1, k + 1, k] = x / rho
-    scaled_curvature = product(second, polar)
-    mean += 0.5 * np.trace(scaled_curvature, axis1=1, axis2=2)
-    covariance = covariance + 0.5 * product(
-        scaled_curvature.reshape(6, 16), scaled_curvature.mT.reshape(6, 16).T
-    )
+    ranges = [max(math.hypot(x, y), SIGMA_FLOOR) for x, y in ((bx, by), (ax, ay))]
+    seen = np.array((bx, by, ranges[0], ranges[0] ** 2, ax, ay, ranges[1], ranges[1] ** 2))
+    library().second_order(address(seen), address(mean), address(covariance))
     return PlanningHypothesis(hypothesis.probability, mean, covariance)
-
-
-def _limited(polar: Array) -> Array:
-    """Limit the variance of each bearing to 1 rad^2: the expansion holds for small angles only."""
-    scale = np.ones(4)
-    for k in (1, 3):
-        scale[k] = min(1.0, 1.0 / math.sqrt(max(polar[k, k], 1e-300)))
-    limited: Array = polar * scale[:, None] * scale
-    return limited
