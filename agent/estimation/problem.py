@@ -73,7 +73,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         tick, radio, rho = tick[order], ranges.radio[order], ranges.rho[order]
         holding, common = radio < 0, ranges.common_errors(priors)[order]
         common[holding] = 0.0
-        numbers = sorted(set(radio.tolist()) - {-1})
+        numbers = ranges.numbers
         if numbers != list(range(len(numbers))):
             radio = np.where(holding, -1, np.searchsorted(numbers, radio))  # without gaps
         v, omega, slip = _velocities(measured.paths, ticks)

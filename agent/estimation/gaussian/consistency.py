@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
 from msgspec.structs import replace
@@ -258,6 +259,7 @@ def _normal(chi2: float, free: int) -> float:
     return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
 
 
+@lru_cache(maxsize=2)
 def _distance_score(fitted: Fit, pair: JointMeasurements) -> float:
     """Return by how many sigmas the ranges favour another distance of the anchors (score test, Rao 1948)."""
     of, walk = fitted.problem.measured, fitted.linear.walk

@@ -72,10 +72,15 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     """
 
     @cached_property
+    def numbers(self) -> list[int]:
+        """The index of each pair of radios that has ranges, ascending."""
+        # numpy.unique would import numpy.ma in the first search of a mission
+        return sorted(set(self.radio.tolist()) - {-1})
+
+    @cached_property
     def pairs(self) -> list[NDArray[np.bool]]:
         """The ranges of each pair of radios that has some; shapes (N,)."""
-        # numpy.unique would import numpy.ma in the first search of a mission
-        return [self.radio == one for one in sorted(set(self.radio.tolist()) - {-1})]
+        return [self.radio == one for one in self.numbers]
 
     @cached_property
     def of_anchors(self) -> dict[int, list[Places]]:
@@ -93,7 +98,7 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         multiplies the measured ranges: then the effects are the same under each guess. The column of the
         delay is in s: its effect is minus the range rate (see `smoother`).
         """
-        rho, radios = self.rho, sorted(set(self.radio.tolist()) - {-1}) if priors.pair_bias else []
+        rho, radios = self.rho, self.numbers if priors.pair_bias else []
         size = bool(priors.range_bias) + bool(priors.range_scale) + len(radios) + bool(priors.range_delay)
         found, column = np.empty((len(rho), size)), 0
         if priors.range_bias:
@@ -312,13 +317,13 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         Which of the older ones are left changes only when their number doubles. Of many pairs of robots,
         fewer are left (see MOST_MUTUAL_RANGES).
         """
-        ranges, pairs = self.ranges, self.ranges.pairs
+        ranges, pairs = self.ranges, len(self.ranges.numbers)
         if most is None:
             correlated = self.noise.wanders or self.noise.priors.slow_sigma > 0.0
             most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
-        if len(ranges.rho) <= min(most, MOST_MUTUAL_RANGES // max(len(pairs), 1)):
+        if len(ranges.rho) <= min(most, MOST_MUTUAL_RANGES // max(pairs, 1)):
             return self
-        rows_of = list(map(np.flatnonzero, pairs))
+        rows_of = list(map(np.flatnonzero, ranges.pairs))
         mutual = [(k := int(ranges.second[rows[0]])) >= 0 and not self.is_anchor(k) for rows in rows_of]
         of_pair = min(most, max(MOST_MUTUAL_RANGES // max(sum(mutual), 1), WEIGHED_OF_PAIR))
         left = np.zeros(len(ranges.rho), bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from functools import lru_cache
 
 import numpy as np
 from msgspec.structs import replace
@@ -12,6 +13,7 @@ from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.evidence import anchor_evidence
 from agent.estimation.gaussian.mission_measurements import LEAST_RANGES, own_measurements
+from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.knowledge import Knowledge, OwnAnchor
@@ -69,12 +71,17 @@ def anchor_planning_hypotheses(knowledge: Knowledge) -> list[PlanningHypothesis]
     hypotheses = []
     for one, branch in zip(knowledge.own_anchor.hypotheses, knowledge.own_anchor.branches, strict=True):
         pose = compose(branch.start, knowledge.odometry)
-        c, s = math.cos(branch.alpha), math.sin(branch.alpha)
-        turn = np.array(((c, -s), (s, c)))
-        covariance = product(product(turn, one.fit.of_start[:2, :2]), turn.T)
         now = np.array((pose.x, pose.y, pose.heading))
-        hypotheses.append(PlanningHypothesis(one.probability, now, covariance))
+        hypotheses.append(PlanningHypothesis(one.probability, now, _in_frame(one.fit, branch.alpha)))
     return hypotheses
+
+
+@lru_cache(maxsize=8)
+def _in_frame(fit: Fit, alpha: float) -> Array:
+    """Return the covariance of the anchor's position in axes that are turned by `alpha` (rad); (2, 2)."""
+    c, s = math.cos(alpha), math.sin(alpha)
+    turn = np.array(((c, -s), (s, c)))
+    return product(product(turn, fit.of_start[:2, :2]), turn.T)
 
 
 def is_anchor_known(knowledge: Knowledge) -> bool:
