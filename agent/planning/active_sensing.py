@@ -106,28 +106,6 @@ def plan_alone(
     return ways.controls(int(np.argmin(cost)))
 
 
-def _weighed(
-    mission: Mission, sigma: float, own: float, farthest: float, outside: float, standing: float
-) -> ctypes.Array[ctypes.c_char]:
-    """Return `Weighed` of hypotheses.c; `own` is as there."""
-    reach = mission.sensing_range
-    of_confusion = (FARTHEST_PREDICTION * reach, SIGMA_FACTOR * sigma, LARGEST_GAP, CONFUSION_COST)
-    lengths = (farthest, NEAREST * reach, NEAREST_TO_ANCHOR * reach)
-    costs = (outside, OUTSIDE_COST, standing)
-    return address(np.array((reach, sigma, own, mission.accuracy**2, *of_confusion, *lengths, *costs)))
-
-
-def _ways(ways: Choice) -> tuple[Any, ...]:
-    """Return the manoeuvres as arguments of hypotheses.c."""
-    return (*ways.along.shape, address(ways.along), address(ways.across))
-
-
-def _poses(hypotheses: Sequence[PlanningHypothesis]) -> tuple[Any, ...]:
-    """Return the number of hypotheses, their probabilities and their poses as arguments of hypotheses.c."""
-    poses = np.concatenate([one.poses for one in hypotheses])
-    return len(hypotheses), address(np.array([one.probability for one in hypotheses])), address(poses)
-
-
 @lru_cache(maxsize=2)  # both robots of one process ask for it
 def plan_together(
     hypotheses: tuple[PlanningHypothesis, ...],
@@ -148,7 +126,8 @@ def plan_together(
     for b; for a only if b is resting.
     """
     ways = choice(mission, objective.strides)
-    a = b = stand = len(ways.v) - 1
+    stand = len(ways.v) - 1
+    a = b = stand
     given = (hypotheses, m2, rho, mission, _information(hypotheses[0].covariance, mission))
     if resting != "b":
         b = _best_of(ways, 1, stand, *given, objective)
@@ -214,6 +193,28 @@ def _keep_apart(
         least = np.min(hypot(ax - bx, ay - by), 1) - 0.5 * lengths_of_both / separation.CHORDS - uncertainty
         allowed &= least >= mission.safety_distance
     return allowed | (lengths_of_both <= separation.leeway(rho, mission))
+
+
+def _weighed(
+    mission: Mission, sigma: float, own: float, farthest: float, outside: float, standing: float
+) -> ctypes.Array[ctypes.c_char]:
+    """Return `Weighed` of hypotheses.c; `own` is as there."""
+    reach = mission.sensing_range
+    of_confusion = (FARTHEST_PREDICTION * reach, SIGMA_FACTOR * sigma, LARGEST_GAP, CONFUSION_COST)
+    lengths = (farthest, NEAREST * reach, NEAREST_TO_ANCHOR * reach)
+    costs = (outside, OUTSIDE_COST, standing)
+    return address(np.array((reach, sigma, own, mission.accuracy**2, *of_confusion, *lengths, *costs)))
+
+
+def _ways(ways: Choice) -> tuple[Any, ...]:
+    """Return the manoeuvres as arguments of hypotheses.c."""
+    return (*ways.along.shape, address(ways.along), address(ways.across))
+
+
+def _poses(hypotheses: Sequence[PlanningHypothesis]) -> tuple[Any, ...]:
+    """Return the number of hypotheses, their probabilities and their poses as arguments of hypotheses.c."""
+    poses = np.concatenate([one.poses for one in hypotheses])
+    return len(hypotheses), address(np.array([one.probability for one in hypotheses])), address(poses)
 
 
 STANDING_COST = 1e300
