@@ -1,4 +1,4 @@
-"""The text of `hypotheses.c` with numpy: guesses for anchors and for placements of pairs, and detections."""
+"""The text of `hypotheses.c` with numpy: initial guesses, detections, and costs of manoeuvres."""
 
 from __future__ import annotations
 
@@ -37,7 +37,24 @@ from agent.estimation.gaussian.placement_guesses import (
     WIDE,
     Encounter,
 )
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, log_likelihood
+from agent.planning.active_sensing import (
+    FARTHEST_PLANNED,
+    NEAREST,
+    NEAREST_TO_ANCHOR,
+    NEGLIGIBLE_GAIN,
+    OUTSIDE_COST,
+    OUTSIDE_COST_ALONE,
+    Objective,
+    _after,
+    _confusion,
+    _effects,
+    _information,
+    _position_variance,
+)
+from agent.planning.strides import Choice
+from protocol.mission import Mission
 from protocol.motion import rotated, rotated_back
 
 ARCCOS, ARCTAN2 = np.vectorize(math.acos), np.vectorize(math.atan2)
@@ -382,3 +399,122 @@ def _log_cdf(x: float) -> float:
     if x > -30.0:
         return math.log(0.5 * math.erfc(-x / math.sqrt(2.0)))
     return -0.5 * x * x - math.log(-x * math.sqrt(2.0 * math.pi))
+
+
+# --- poses to second order ----------------------------------------------------------------------------
+
+
+def second_order_by_numpy(hypothesis: PlanningHypothesis, m2: tuple[float, float]) -> tuple[Array, Array]:
+    """Return the mean and the covariance of both poses; see `planning_hypotheses.to_second_order`."""
+    mean, covariance = hypothesis.poses.copy(), hypothesis.covariance
+    bx, by = mean[3] - m2[0], mean[4] - m2[1]
+    ax, ay = mean[0] - mean[3], mean[1] - mean[4]
+    # gradients of range and bearing of b, then of a from b, with respect to the poses
+    rows, second = np.zeros((4, 6)), np.zeros((6, 4, 4))
+    for k, (x, y), moved in ((0, (bx, by), (3,)), (2, (ax, ay), (0, 3))):
+        rho = max(math.hypot(x, y), SIGMA_FLOOR)
+        for row, (gx, gy) in ((k, (x / rho, y / rho)), (k + 1, (-y / rho**2, x / rho**2))):
+            for i, sign in zip(moved, (1.0, -1.0), strict=False):
+                rows[row, i : i + 2] = sign * gx, sign * gy
+        for i in (0,) if k else (0, 3):
+            second[i, k + 1, k + 1], second[i + 1, k + 1, k + 1] = -x, -y
+            second[i, k, k + 1] = second[i, k + 1, k] = -y / rho
+            second[i + 1, k, k + 1] = second[i + 1, k + 1, k] = x / rho
+    polar, scale = product(product(rows, covariance), rows.T), np.ones(4)
+    for k in (1, 3):
+        scale[k] = min(1.0, 1.0 / math.sqrt(max(polar[k, k], 1e-300)))
+    curved = product(second, polar * scale[:, None] * scale)
+    mean += 0.5 * np.trace(curved, axis1=1, axis2=2)
+    return mean, covariance + 0.5 * product(curved.reshape(6, 16), curved.mT.reshape(6, 16).T)
+
+
+# --- the costs of manoeuvres --------------------------------------------------------------------------
+
+
+def own_costs_by_numpy(
+    ways: Choice,
+    hypotheses: Sequence[PlanningHypothesis],
+    mission: Mission,
+    within: float | None,
+    objective: Objective,
+) -> Array:
+    """Return the costs of `active_sensing.own_costs`."""
+    best = hypotheses[0]
+    reach = mission.sensing_range
+    distances = []
+    for one in hypotheses:
+        x, y = ways.ends(one.poses)
+        distances.append(np.maximum(hypot(x, y), SIGMA_FLOOR))
+        if one is best:
+            ux, uy = x / distances[0], y / distances[0]
+    sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
+    weight = (distances[0] <= reach) / sigma**2
+    information = _information(best.covariance, mission)
+    xx = information[0, 0] + np.sum(weight * ux * ux, 1)
+    xy = information[0, 1] + np.sum(weight * ux * uy, 1)
+    yy = information[1, 1] + np.sum(weight * uy * uy, 1)
+    cost: Array = (xx + yy) / np.maximum(xx * yy - xy * xy, 1e-300) / mission.accuracy**2
+    cost += _confusion(hypotheses, distances, sigma, reach)
+    cost[-1] += objective.standing_cost
+    limit = within if within is not None else reach
+    for one, distance in zip(hypotheses, distances, strict=True):
+        cost += one.probability * OUTSIDE_COST * np.maximum(0.0, NEAREST_TO_ANCHOR * reach - distance[:, 0])
+        margin = math.sqrt(max(0.0, float(np.trace(one.covariance)))) if within is None else 0.0
+        loss = OUTSIDE_COST if within is not None else OUTSIDE_COST_ALONE
+        cost += one.probability * loss * np.maximum(0.0, distance[:, 0] + min(margin, 0.1 * reach) - limit)
+    return cost
+
+
+def joint_costs_by_numpy(
+    ways: Choice,
+    moving: int,
+    other: int,
+    hypotheses: Sequence[PlanningHypothesis],
+    m2: tuple[float, float],
+    mission: Mission,
+    objective: Objective,
+) -> Array:
+    """Return the costs of `active_sensing.joint_costs`."""
+    count, given = len(ways.v), np.array([other])
+    of_a, of_b = (given, np.arange(count)) if moving else (np.arange(count), given)
+    reach = mission.sensing_range
+    own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
+    sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
+    anchors = ((0.0, 0.0), m2)
+    distances = []
+    cost = np.zeros(count)
+    for one in hypotheses:
+        ax, ay = ways.ends(one.poses[:3], of_a)
+        bx, by = ways.ends(one.poses[3:], of_b)
+        dx, dy = ax - bx, ay - by
+        distance = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
+        distances.append(distance)
+        off_anchor = hypot(bx[:, 0] - m2[0], by[:, 0] - m2[1])
+        for beyond, loss in (
+            (distance[:, 0] - FARTHEST_PLANNED * reach, objective.outside_cost),
+            (off_anchor - FARTHEST_PLANNED * reach, objective.outside_cost),
+            (NEAREST * reach - np.min(distance, 1), OUTSIDE_COST),
+            (NEAREST_TO_ANCHOR * reach - off_anchor, OUTSIDE_COST),
+        ):
+            cost += one.probability * loss * np.maximum(0.0, beyond)
+        if one is not hypotheses[0]:
+            continue
+        ahead = distance.shape[1]
+        rows = np.zeros((count, 3 * ahead, 6))
+        nx, ny = dx / distance, dy / distance
+        weight = (distance <= reach) / sigma
+        for robot, (x, y), sign in ((0, (ax, ay), 1.0), (1, (bx, by), -1.0)):
+            moved = x - one.poses[3 * robot], y - one.poses[3 * robot + 1]
+            ox, oy = x - anchors[robot][0], y - anchors[robot][1]
+            rho = np.maximum(hypot(ox, oy), SIGMA_FLOOR)
+            own, own_rows = (rho <= reach) / rho / own_sigma, slice((robot + 1) * ahead, (robot + 2) * ahead)
+            effects = zip(_effects(nx, ny, *moved), _effects(ox, oy, *moved), strict=True)
+            for i, (of_mutual, of_own) in enumerate(effects, 3 * robot):
+                rows[:, :ahead, i], rows[:, own_rows, i] = sign * of_mutual * weight, of_own * own
+        after = _after(one.covariance, rows, mission)
+        for i, (x, y) in ((0, (ax, ay)), (3, (bx, by))):
+            variance = _position_variance(after, i, x[:, -1] - one.poses[i], y[:, -1] - one.poses[i + 1])
+            cost += variance / mission.accuracy**2
+    cost += _confusion(hypotheses, distances, sigma, reach)
+    cost[-1] += objective.standing_cost
+    return cost

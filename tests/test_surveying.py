@@ -13,14 +13,23 @@ from msgspec.structs import replace
 from agent.estimation.exact_estimator import EXACT_ESTIMATOR
 from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.gaussian.odometry_noise import Array
-from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
-from agent.planning.active_sensing import plan_alone, plan_together
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis, to_second_order
+from agent.planning.active_sensing import (
+    CONTINUED,
+    STALLED,
+    _information,
+    joint_costs,
+    own_costs,
+    plan_alone,
+    plan_together,
+)
 from agent.planning.drive import pursuit, towards
 from agent.planning.strides import STRIDES_AHEAD, choice, stride
 from protocol.mission import Mission
 from protocol.motion import REST, Controls, Pose, step
 from protocol.noise import Noise, VelocityNoise
 from protocol.orbits import Orbit, clearance, rendezvous
+from tests.hypotheses_by_numpy import joint_costs_by_numpy, own_costs_by_numpy, second_order_by_numpy
 
 SIGMA = 0.1
 MISSION = Mission(3.0, 1.0, 1.0, math.pi, noise=Noise(SIGMA, SIGMA))
@@ -119,6 +128,33 @@ def test_together_robots_keep_in_range_and_apart(
     there, peer = after(a, by_a), after(b, by_b)
     assert 0.15 * REACH < math.hypot(there.x - peer.x, there.y - peer.y) < 0.95 * REACH
     assert math.hypot(peer.x - M2[0], peer.y - M2[1]) < 0.95 * REACH
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_compiled_costs_of_manoeuvres_are_those_of_their_text_to_the_bit(seed: int) -> None:
+    draw = np.random.default_rng(seed)
+    mission = replace(
+        MISSION, noise=Noise(*draw.choice([0.0, 1e-3, 0.1], 2)), accuracy=draw.uniform(0.01, 0.3)
+    )
+    objective, within = (CONTINUED, STALLED)[seed % 2], (None, 0.7)[seed // 2 % 2]
+    ways, m2 = choice(mission, objective.strides), (float(draw.uniform(1.0, 9.0)), float(draw.normal()))
+    of_both, of_one = [], []
+    for probability in draw.dirichlet(np.ones(draw.integers(1, 6))).tolist():
+        root, poses = draw.normal(size=(6, 6)) * 10.0 ** draw.uniform(-3.0, 0.0), draw.normal(size=6)
+        poses[3:5] += m2
+        of_both.append(PlanningHypothesis(probability, poses, root @ root.T))
+        of_one.append(PlanningHypothesis(probability, poses[:3], (root @ root.T)[:2, :2]))
+        mean, covariance = second_order_by_numpy(of_both[-1], m2)
+        found = to_second_order(of_both[-1], m2)
+        assert np.array_equal(found.poses, mean)
+        assert np.array_equal(found.covariance, covariance)
+    given = (ways, of_one, mission, within, objective)
+    assert np.array_equal(own_costs(*given), own_costs_by_numpy(*given))
+    information = _information(of_both[0].covariance, mission)
+    for moving, other in ((0, 5), (1, len(ways.v) - 1)):
+        costs = joint_costs(ways, moving, other, of_both, m2, mission, information, objective)
+        text = joint_costs_by_numpy(ways, moving, other, of_both, m2, mission, objective)
+        assert np.array_equal(costs, text)
 
 
 # --- the circle ---------------------------------------------------------------------------------------

@@ -91,19 +91,29 @@ def plan_alone(
     is the largest allowed distance from the anchor in m. The `outside_cost` of the objective does not count:
     that of a robot alone is OUTSIDE_COST_ALONE, or OUTSIDE_COST beyond `within`.
     """
-    ways, reach = choice(mission, objective.strides), mission.sensing_range
+    ways = choice(mission, objective.strides)
+    return ways.controls(int(np.argmin(own_costs(ways, hypotheses, mission, within, objective))))
+
+
+def own_costs(
+    ways: Choice,
+    hypotheses: Sequence[PlanningHypothesis],
+    mission: Mission,
+    within: float | None,
+    objective: Objective,
+) -> Array:
+    """Return the cost of each manoeuvre of a robot alone, (C,); see `plan_alone`."""
+    reach, limit = mission.sensing_range, within
     sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
-    margins, loss, limit = np.zeros(len(hypotheses)), OUTSIDE_COST, within
+    margins, loss = np.zeros(len(hypotheses)), OUTSIDE_COST
     if limit is None:
         sigmas = [math.sqrt(max(0.0, float(np.trace(one.covariance)))) for one in hypotheses]
         margins, loss, limit = np.minimum(sigmas, 0.1 * reach), OUTSIDE_COST_ALONE, reach
     by = _weighed(mission, sigma, sigma**2, limit, loss, objective.standing_cost)
     information, cost = _information(hypotheses[0].covariance, mission), np.empty(len(ways.v))
-    library().own_costs(
-        *(by, *_ways(ways), *_poses(hypotheses)),
-        *map(address, (margins, information, cost)),
-    )
-    return ways.controls(int(np.argmin(cost)))
+    given = map(address, (margins, information, cost))
+    library().own_costs(by, *_ways(ways), *_poses(hypotheses), *given)
+    return cost
 
 
 @lru_cache(maxsize=2)  # both robots of one process ask for it
@@ -128,45 +138,57 @@ def plan_together(
     ways = choice(mission, objective.strides)
     stand = len(ways.v) - 1
     a = b = stand
-    given = (hypotheses, m2, rho, mission, _information(hypotheses[0].covariance, mission))
+    given = (hypotheses, m2, mission, _information(hypotheses[0].covariance, mission))
     if resting != "b":
-        b = _best_of(ways, 1, stand, *given, objective)
+        cost = joint_costs(ways, 1, stand, *given, objective)
+        b = _best_of(cost, ways, np.array([stand]), np.arange(stand + 1), hypotheses, rho, mission)
     if resting != "a":
         of_a = objective if resting == "b" else objective._replace(standing_cost=0.0)
-        a = _best_of(ways, 0, b, *given, of_a)
+        cost = joint_costs(ways, 0, b, *given, of_a)
+        a = _best_of(cost, ways, np.arange(stand + 1), np.array([b]), hypotheses, rho, mission)
     return ways.controls(a), ways.controls(b)
 
 
-def _best_of(
+def joint_costs(
     ways: Choice,
     moving: int,
     other: int,
     hypotheses: Sequence[PlanningHypothesis],
     m2: tuple[float, float],
-    latest: float,
     mission: Mission,
     information: Array,
     objective: Objective,
-) -> int:
-    """Return the best manoeuvre of a robot (0 or 1) while the other one executes that with the index `other`.
+) -> Array:
+    """Return the cost of each manoeuvre of the robot `moving` (0 or 1), (C,); see `plan_together`.
 
-    The last manoeuvre is to stand. `information` is that on both poses, and `latest` the latest range (m).
+    The other one executes the manoeuvre with the index `other`, and `information` is that on both poses.
     """
     own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     farthest, outside = FARTHEST_PLANNED * mission.sensing_range, objective.outside_cost
     by = _weighed(mission, sigma, own_sigma, farthest, outside, objective.standing_cost)
-    anchors, cost = np.array((0.0, 0.0, *m2)), np.empty(len(ways.v))
-    found = library().joint_costs(
-        *(by, *_ways(ways), moving, other, *_poses(hypotheses)),
-        *map(address, (anchors, information, cost)),
-    )
-    if not found:
+    cost = np.empty(len(ways.v))
+    given = map(address, (np.array((0.0, 0.0, *m2)), information, cost))
+    if not library().joint_costs(by, *_ways(ways), moving, other, *_poses(hypotheses), *given):
         raise Singular("the information on the poses is singular")
+    return cost
+
+
+def _best_of(
+    cost: Array,
+    ways: Choice,
+    of_a: Places,
+    of_b: Places,
+    hypotheses: Sequence[PlanningHypothesis],
+    rho: float,
+    mission: Mission,
+) -> int:
+    """Return the cheapest of the manoeuvres `of_a` and `of_b` that keeps the safety distance, or to stand.
+
+    One of both has a single manoeuvre, the last one of the other is to stand; `rho` is the latest range (m).
+    """
     if mission.safety_distance:
-        every, given = np.arange(len(cost)), np.array([other])
-        of_a, of_b = (given, every) if moving else (every, given)
-        cost[~_keep_apart(ways, hypotheses, latest, mission, of_a, of_b)] = np.inf
+        cost[~_keep_apart(ways, hypotheses, rho, mission, of_a, of_b)] = np.inf
         cost[-1] = min(cost[-1], STANDING_COST)
     return int(np.argmin(cost))
 
