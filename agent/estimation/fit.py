@@ -402,8 +402,10 @@ def _fit(problem: Problem, found: Fitted) -> Fit:
 
 def _start_of(problem: Problem, poses: Array, constant: Array, white: Array) -> Start:
     """Return the poses at tick 0 with the errors of the odometry."""
-    parts = zip(white, constant, problem.lengths, strict=True)
-    errors = [Errors(v[:ticks], omega[:ticks], own) for (v, omega), own, ticks in parts]
+    errors = [
+        Errors(white[i, 0, :ticks], white[i, 1, :ticks], constant[i])
+        for i, ticks in enumerate(problem.lengths)
+    ]
     return Start(poses.reshape(-1, 3), tuple(errors))
 
 

@@ -67,11 +67,14 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         n, lengths = len(measured.paths), tuple([len(path.v) for path in measured.paths])
         ticks = max(lengths, default=0)
         tick = np.minimum(ranges.tick, ticks)
-        order = tick.argsort(kind="stable")
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        tick, radio, rho = tick[order], ranges.radio[order], ranges.rho[order]
-        holding, common = radio < 0, ranges.common_errors(priors)[order]
+        in_order = not (tick[1:] < tick[:-1]).any()  # as those of a robot alone are
+        order = back = np.arange(len(tick)) if in_order else tick.argsort(kind="stable")
+        if not in_order:
+            back = np.empty_like(order)
+            back[order] = np.arange(len(order))
+        some = slice(None) if in_order else order
+        tick, radio, rho = tick[some], ranges.radio[some], ranges.rho[some]
+        holding, common = radio < 0, ranges.common_errors(priors)[some]
         common[holding] = 0.0
         numbers = ranges.numbers
         if numbers != list(range(len(numbers))):
@@ -92,15 +95,15 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             stray=stray,
             patterns=constant_errors(v, omega, noise),
             begin=tick.searchsorted(np.arange(ticks + 2)),
-            first=ranges.first[order],
-            second=ranges.second[order],
-            place=ranges.place[order],
+            first=ranges.first[some],
+            second=ranges.second[some],
+            place=ranges.place[some],
             rho=rho,
             common=common,
             scaled=-1 if not priors.range_scale or few else SCALE_AFTER_BIAS * bool(priors.range_bias),
             scale=priors.range_scale,
             delayed=common.shape[1] - 1 if priors.range_delay else -1,
-            anchor=anchor[order],
+            anchor=anchor[some],
             anchors=anchors,
             survey=priors.survey_error,
             radio=radio,
@@ -113,7 +116,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         )
         by = Weighing.of(
             noise,
-            ranges.sigma[order],
+            ranges.sigma[some],
             holding.astype(np.intp),
             radio.argsort(kind="stable"),
             float(rho[~holding].max(initial=SIGMA_FLOOR)),
