@@ -51,11 +51,6 @@ class EncodedMessages(dict[bytes, Any]):
         return frame
 
 
-def body(frame: bytes) -> bytes:
-    """Return the body of `frame`, in msgpack."""
-    return frame[_HEAD.size :]
-
-
 def is_sound(frame: bytes) -> bool:
     """Return whether `frame` has this version and the right checksum. Its body is not decoded."""
     return len(frame) > _HEAD.size and _HEAD.unpack_from(frame) == (VERSION, zlib.crc32(frame[_HEAD.size :]))

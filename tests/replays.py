@@ -11,18 +11,14 @@ frame may be missing.
 from __future__ import annotations
 
 import argparse
+import csv
 import os
 import random
 import signal
-import struct
 import sys
 import tempfile
-import zlib
-from collections import defaultdict
+from collections import Counter
 from pathlib import Path
-
-import msgpack
-from mcap.reader import make_reader
 
 from compose.audit.findings import Findings
 from compose.audit.rules import replayed
@@ -92,25 +88,19 @@ def killed(draw: random.Random, folder: Path) -> tuple[str, bool]:
     recording = read(out, audited=True)
     result, torn = replayed(recording), {name: one.torn for name, one in recording.journals.items()}
     export(read(out), folder / "exported")
-    there = {name: journal_file.packed(journal_file.read(out / name)) for name in torn}
-    whole = all(len(there[name]) + torn[name] == (out / name).stat().st_size for name in torn)
-    exported = journals_of(folder / "exported" / "run.mcap") == {k: v for k, v in there.items() if v}
+    there = {name: list(journal_file.read(out / name)) for name in torn}
+    sizes = {name: len(journal_file.packed(frames)) for name, frames in there.items()}
+    whole = all(sizes[name] + torn[name] == (out / name).stat().st_size for name in torn)
+    frames = {name: len(one) for name, one in there.items() if one}
+    exported = exported_frames(folder / "exported") == frames
     what = f"{victim} after {moment} bytes: {result.ticks} ticks, {sum(torn.values())} bytes torn"
     return what, bool(result.tears) and not result.differences and whole and exported
 
 
-def journals_of(path: Path) -> dict[str, bytes]:
-    """Return the journals as restored from the messages of a run.mcap."""
-    frames: dict[str, list[bytes]] = defaultdict(list)
-    with path.open("rb") as file:
-        for _, channel, message in make_reader(file, validate_crcs=True).iter_messages(log_time_order=False):
-            if not channel.topic.startswith("/journal/"):
-                continue
-            _, _, name, kind = channel.topic.split("/")
-            assert (channel.message_encoding, msgpack.unpackb(message.data)[0]) == ("msgpack", kind)
-            head = struct.pack(">BI", int(channel.metadata["version"]), zlib.crc32(message.data))
-            frames[f"{name}.journal"].append(head + message.data)
-    return {name: journal_file.packed(ones) for name, ones in frames.items()}
+def exported_frames(folder: Path) -> Counter[str]:
+    """Return the numbers of frames of each journal in the frames.csv of an export."""
+    with (folder / "frames.csv").open(newline="") as file:
+        return Counter(row["journal"] for row in csv.DictReader(file))
 
 
 if __name__ == "__main__":

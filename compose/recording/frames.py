@@ -9,7 +9,6 @@ from msgspec.structs import astuple
 
 from compose.recording.run import Run
 from protocol.messages import Command, DeadlineMissed, Estimate, Localised, MissionEnd, Observation
-from protocol.wire import body
 
 
 class Journaled(msgspec.Struct, frozen=True):
@@ -30,11 +29,6 @@ class Journaled(msgspec.Struct, frozen=True):
     def kind(self) -> str:
         """The name of the kind of message on the wire, such as "observation"."""
         return kind_of(type(self.message))
-
-    @property
-    def body(self) -> bytes:
-        """The frame without its head, as msgpack. The head is the version and the CRC of the body."""
-        return body(self.frame)
 
     @property
     def json(self) -> str:

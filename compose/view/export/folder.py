@@ -40,7 +40,7 @@ def export(
     make_folder(out)
     paths = tuple([out / name for name in FILES])
     writers: Sequence[Callable[[Path], object]] = (
-        lambda path: path.write_bytes(mcap(setup, frames, scenes_of(run), check)),
+        lambda path: path.write_bytes(mcap(setup, scenes_of(run), check)),
         lambda path: path.write_bytes(layout(setup)),
         lambda path: path.write_text(csv_text(MessageRow, message_rows(frames, check)), encoding="utf-8"),
         lambda path: path.write_text(csv_text(TickRow, ticks), encoding="utf-8"),
