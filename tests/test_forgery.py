@@ -73,7 +73,6 @@ def told(received: ReceivedMission) -> dict[str, Any]:
         "ticks": repr(known.ticks),
         "end": known.end,
         "last": known.last,
-        "farewells": known.final_reports,
     }
 
 

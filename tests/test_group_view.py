@@ -222,7 +222,7 @@ def test_a_robot_outside_the_mission_changes_nothing_that_viewers_show(run: Run)
     views = Views(setup)
     for scene in scenes_told:
         list(views.of(scene))
-    series(setup, told, 0, told.last)
+    series(setup, told)
 
 
 def test_configurations_alone_have_the_same_plan_of_meetings(run: Run) -> None:
@@ -342,7 +342,7 @@ def test_the_mutual_range_is_that_to_the_robot_of_the_present_meeting(crowd: Run
             one = Numbers.in_scene(scene, setup.robot_setup(player.robot), setup)
             ranges = [contact.range for contact in player.contacts if contact.peer == player.peer]
             assert [one.mutual_range_m] == ranges or not ranges
-    (curves,) = series(setup, known, 0, known.last, ["a"]).robots
+    (curves,) = series(setup, known, ["a"]).robots
     numbers = [scene.player("a").contacts for scene in scenes_of(crowd)]
     assert len(curves.curves["mutual_range_m"].low) == len(numbers)
 

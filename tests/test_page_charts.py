@@ -68,7 +68,7 @@ def served(noisy: Path) -> Iterator[str]:
 def series_of(run: Run) -> Series:
     """Return the series of all ticks and robots of a run."""
     assert run.setup is not None
-    return series(run.setup, run_data(run), 0, run.length - 1)
+    return series(run.setup, run_data(run))
 
 
 def estimates(run: Run, robot: str) -> dict[int, Estimate]:
@@ -162,15 +162,15 @@ def known(curve: Curve, first: int, count: int) -> list[float]:
     return [value for value in curve.low[first : first + count] if value is not None]
 
 
-def test_a_series_has_at_most_1000_points_and_keeps_within_the_run(paper_1: Path) -> None:
+def test_a_series_has_at_most_1000_points_and_no_sigma_of_exact_sensors(paper_1: Path) -> None:
     run = read(paper_1)
     assert run.setup is not None
     assert MOST_BINS <= 500
-    beyond = series(run.setup, run_data(run), 40, 10**9, ["b"])
-    assert (beyond.first, beyond.last, beyond.exact) == (40, run.length - 1, True)
-    assert [one.robot for one in beyond.robots] == ["b"]
-    assert "position_bound_m" not in beyond.robots[0].curves
-    errors = beyond.robots[0].curves["position_error_m"].high
+    of_b = series(run.setup, run_data(run), ["b"])
+    assert (of_b.first, of_b.last, of_b.exact) == (0, run.length - 1, True)
+    assert [one.robot for one in of_b.robots] == ["b"]
+    assert "position_bound_m" not in of_b.robots[0].curves
+    errors = of_b.robots[0].curves["position_error_m"].high
     largest = max(error for error in errors if error is not None)
     assert largest > 1.0, "of equally probable poses, the error is that of the farthest"
     assert errors[-1] == pytest.approx(0.0, abs=1e-6)
@@ -179,12 +179,12 @@ def test_a_series_has_at_most_1000_points_and_keeps_within_the_run(paper_1: Path
 # --- the page ---------------------------------------------------------------------------------------
 
 
-def at_tick(page: Page, tick: int, first: float, last: float) -> tuple[float, float]:
-    """Return the place of `tick` in the first strip, which shows the ticks `first` to `last`."""
+def at_tick(page: Page, tick: int, last: float) -> tuple[float, float]:
+    """Return the place of `tick` in the first strip, which shows the ticks 0 to `last`."""
     box = page.locator(CHARTS).bounding_box()
     assert box is not None
     width = box["width"] / 2 - sum(INSET)
-    return INSET[0] + width * (tick - first) / (last - first), 40.0
+    return INSET[0] + width * tick / last, 40.0
 
 
 def until_read(page: Page, tick: int) -> None:
@@ -206,7 +206,7 @@ def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
     until_read(page, 3)
     assert min(page.locator("#strips canvas").first.evaluate(DRAWN)) > 100
     tick = next(k for k in range(20, last) if estimates(run, "a")[k].world)
-    x, y = at_tick(page, tick, 0, last)
+    x, y = at_tick(page, tick, last)
     charts.click(position={"x": x, "y": y})
     until_shown(page, tick)
     one, truth = estimates(run, "a")[tick], run.truth("a")[tick]
@@ -221,17 +221,12 @@ def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
     expect(charts).to_have_attribute(
         "aria-label", re.compile(r"error / 3 sigma: a 3 sigma \d\S+ m, b 3 sigma")
     )
-    charts.focus()
-    for _ in range(8):
-        page.keyboard.press("+")  # to 8 ticks, the fewest; the tick stays where it is
-    first = tick - 8.0 * tick / last
-    near = math.ceil(first) + 1
-    x, y = at_tick(page, near, first, first + 8.0)
-    charts.click(position={"x": x, "y": y})
-    until_shown(page, near)
-    page.get_by_role("button", name="Show all ticks in the charts").click()
-    x, y = at_tick(page, 5, 0, last)
-    charts.click(position={"x": x, "y": y})
+    x, y = at_tick(page, 5, last)
+    charts.hover(position={"x": at_tick(page, 8, last)[0], "y": y})
+    page.mouse.down()
+    until_shown(page, 8)
+    charts.hover(position={"x": x, "y": y})
+    page.mouse.up()
     until_shown(page, 5)
     shot(page, "charts")
 

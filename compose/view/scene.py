@@ -35,13 +35,8 @@ class Sent(msgspec.Struct, frozen=True):
 
     bytes: int
     """The size of the frame in bytes, or of all frames."""
-    phase: Phase | None = None
-    """The phase; None, like the following fields, for a planner with reports of its own."""
-    state: Word | None = None
     through: int | None = None
-    """The last tick of the manoeuvres in the report's log."""
-    heard: int | None = None
-    """The last tick of the peer's manoeuvres that the report acknowledges."""
+    """The last tick of the manoeuvres in the report's log; None for a planner with reports of its own."""
 
 
 class Decision(msgspec.Struct, frozen=True):
@@ -247,7 +242,6 @@ def player_of(
         known["sent"] = Sent(sum(sent)) if sent else None
     elif peer is not None and (sized := now.reports.get((robot, peer))) is not None:
         report = sized.report
-        shared = (report.phase, report.state, report.through, report.heard) if report.body is None else ()
-        known["sent"] = Sent(sized.bytes, *shared)
+        known["sent"] = Sent(sized.bytes, report.through if report.body is None else None)
     held = held_poses(robot, now)
     return Player(robot, sentence, down=down, held=held, peer=peer if setup.visits else None, **known)

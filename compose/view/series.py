@@ -50,16 +50,15 @@ class Series(msgspec.Struct, frozen=True):
 def series(
     setup: RunSetup,
     known: RunData,
-    first: int,
-    last: int,
     robots: Collection[str] | None = None,
     check: Callable[[], None] = lambda: None,
 ) -> Series:
-    """Return the series of `robots`, or of all if None, from tick `first` to tick `last`, inclusive.
+    """Return the series of `robots`, or of all if None, from the first known tick to the last.
 
     `check` is called for each tick and each bin, and may raise an exception to end the computation.
     """
-    last = max(min(last, known.last), first)
+    first = next(iter(known.ticks), 0)
+    last = max(known.last, first)
     step = -(-(last - first + 1) // MOST_BINS)
     bins: list[list[tuple[RunSetup, TickData]]] = [[] for _ in range(first, last + 1, step)]
     for tick in known.between(first, last):

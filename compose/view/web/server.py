@@ -187,8 +187,6 @@ class _Answers:
     async def series(self, request: Request) -> Response:
         """Return the numbers of the robots named `robot`, of all without a name, over time."""
         show, setup = self._show(request)
-        first = min(_number(request, "from", 0), max(show.known.last, 0))
-        last = _number(request, "to", show.known.last)
         robots = request.query_params.getlist("robot") or None
         give_up = time.monotonic() + LONGEST_SERIES_S
 
@@ -197,7 +195,7 @@ class _Answers:
                 raise _Refused(503, f"it takes more than {LONGEST_SERIES_S:g} s: ask for fewer robots")
 
         # A thread, because thousands of ticks take longer than the interval of the news.
-        return _json(await self._computed(series, setup, show.known, first, last, robots, check))
+        return _json(await self._computed(series, setup, show.known, robots, check))
 
     async def news(self, request: Request) -> Response:
         stream = news_events(self._site, request.query_params.get("show"), _number(request, "since", 0))

@@ -104,7 +104,6 @@ class WatchedRun(ABC):
             "live": self.live,
             "has_truth": self.known.has_truth,
             "end": end_of(self.known.end),
-            "farewells": self.known.final_reports,
             "notes": self.notes,
         }
 

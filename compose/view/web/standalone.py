@@ -39,7 +39,7 @@ def standalone_page(folder: Path) -> tuple[str, list[str]]:
         "list": site.listed(),
         "mission": show.mission,
         "scenes": scenes(show.setup, show.known),
-        "series": series(show.setup, show.known, show.mission["first"], show.mission["last"]),
+        "series": series(show.setup, show.known),
     }
     return _page(show.setup.name, msgspec.json.encode(recording).decode()), site.notes
 

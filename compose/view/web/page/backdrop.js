@@ -4,6 +4,7 @@
 import { TAU } from "./geometry.js";
 import { draw_tree } from "./group.js";
 import { DASHED } from "./pen.js";
+import { rounded_up } from "./strip.js";
 import { kinds_of } from "./trails.js";
 import { metres } from "./words.js";
 
@@ -57,8 +58,7 @@ export class Backdrop {
   /** Draws the grid, and a bar with its unit. */
   #grid(look) {
     const { pen, plane } = this, { width, height, scale, centre } = plane;
-    const raw = Math.min(80, width / 9) / scale, power = 10 ** Math.floor(Math.log10(raw));
-    const unit = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;
+    const unit = rounded_up(Math.min(80, width / 9) / scale);
     pen.strokeStyle = look.grid;
     pen.lineWidth = 1;
     pen.beginPath();

@@ -4,7 +4,7 @@ import { distance, wrap } from "./geometry.js";
 import { counted, task } from "./group.js";
 import { leads } from "./held.js";
 import { LEAST_GAP_M } from "./trails.js";
-import { metres, probability, PHASES, place, plural, rad, speed, STEPS, turning } from "./words.js";
+import { metres, probability, PHASES, place, rad, speed, STEPS, turning } from "./words.js";
 
 const MOST_PROBABILITIES = 5;
 const MANY = 4;
@@ -142,8 +142,6 @@ class Card {
     this.#row("belief", held ? believed(held) : "–");
     if (truth) this.#row("true pose", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "unknown");
     else if (this.fields.has("true pose")) this.#row("true pose", "hidden");
-    const counted = store.counted(this.robot.id, tick);
-    this.#row("totals", counted ? totals(counted) : "…");
     this.#probability(held);
   }
 
@@ -219,13 +217,6 @@ function believed({ local, world, probability: chances, covariance, localised })
   if (local.length > 1) return `${local.length} hypotheses in the anchor's frame`;
   if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, bearing unknown`;
   return "pose unknown";
-}
-
-function totals({ anchor, mutual, sent, heard, refused, lost, bytes }) {
-  const reports = [`${plural(sent, "report")} sent`, `${heard} received`];
-  if (refused) reports.push(`${refused} received damaged`);
-  if (lost) reports.push(`${lost} sent but lost`);
-  return `${anchor} anchor ranges, ${mutual} mutual ranges; ${reports.join(", ")}; ${bytes} bytes sent`;
 }
 
 export function make(tag, properties, ...children) {

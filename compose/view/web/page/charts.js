@@ -2,6 +2,7 @@
 
 import * as data from "./data.js";
 import { DASHED, unit } from "./pen.js";
+import { dragged, extent, fresh_pen, number_ticks, palette, resize, rounded_up } from "./strip.js";
 import { metres, probability } from "./words.js";
 
 const TOP = 17;
@@ -14,14 +15,14 @@ const GAP = 26;
 const LEFT = 46;
 const RIGHT = 8;
 const TWO_COLUMNS = 760;
-/** The smallest visible number of ticks. */
-const FEWEST = 8;
 const LEAST_M = 1e-4;
 /** The shortest time between two readings while a mission runs, and, next, the time after which a failed one is repeated. */
 const REFRESH_MS = 250;
 const RETRY_MS = 2000;
 /** The dashes of a line by role, so that two robots differ without colour. */
 const DASHES = { a: [], b: DASHED };
+/** The factors of the ends of scales. */
+const STEPS = [1, 2, 3, 5, 10];
 /** A strip: its title, its curves, its scale, the text of a value, and the sentence in place of no curves. */
 const STRIPS = [
   {
@@ -39,7 +40,7 @@ const STRIPS = [
   {
     title: "ranges", curves: ["anchor_range_m", "mutual_range_m"], text: metres, none: "no ranges in these ticks",
     scale: ({ most }) => {
-      const high = [1, 2, 3, 5, 10].map((factor) => factor * 10 ** Math.floor(Math.log10(most || 1))).find((one) => one >= most);
+      const high = rounded_up(most || 1, STEPS);
       return { low: 0, high, marks: [0, high], unit: " m" };
     },
   },
@@ -61,36 +62,11 @@ export class Charts {
     Object.assign(this, { box, root, changed });
     this.#summary = box.querySelector("summary");
     [this.canvas, this.cursor] = root.querySelectorAll("canvas");
-    const x = (event) => (event.clientX - this.cursor.getBoundingClientRect().left) / unit();
-    let held = null; // the column in which a drag has begun
-    this.cursor.addEventListener("pointerdown", (event) => {
-      held = this.#column(x(event));
-      this.cursor.setPointerCapture(event.pointerId);
-      go(Math.round(this.#tick(x(event), held)));
-    });
-    this.cursor.addEventListener("pointermove", (event) => { if (held !== null) go(Math.round(this.#tick(x(event), held))); });
-    for (const name of ["pointerup", "pointercancel"]) this.cursor.addEventListener(name, () => { held = null; });
-    this.cursor.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      if (event.shiftKey || Math.abs(event.deltaX) > Math.abs(event.deltaY)) this.#shift((event.deltaX || event.deltaY) * 0.001);
-      else this.zoom(Math.exp(-event.deltaY * 0.0015), this.#tick(x(event), this.#column(x(event))));
-    }, { passive: false });
-    root.addEventListener("keydown", (event) => {
-      const action = { "+": 1.6, "=": 1.6, "-": 1 / 1.6 }[event.key];
-      if (event.ctrlKey || event.metaKey || event.altKey || !(action || event.key === "0")) return;
-      event.preventDefault();
-      event.stopPropagation(); // else the plane zooms as well
-      if (action) this.zoom(action);
-      else this.reset();
-    });
-    for (const button of root.querySelectorAll("button")) {
-      button.addEventListener("click", () => (button.value ? this.zoom(Number(button.value)) : this.reset()));
-    }
+    const x = ({ clientX }) => (clientX - this.cursor.getBoundingClientRect().left) / unit();
+    dragged(this.cursor, (event, began) => go(Math.round(this.#tick(x(event), this.#column(x(began))))));
     box.addEventListener("toggle", changed);
   }
 
-  /** The visible ticks, [from, to]; null for all. */
-  span = null;
   tall = TALL;
   #columns = 1;
   #series = null;
@@ -101,40 +77,18 @@ export class Charts {
   #read_ms = -Infinity;
   #pause_ms = REFRESH_MS;
   #drawn = "";
-  #at = null;
   #later = null;
   #summary;
 
   /** Discards what belongs to another mission. */
   stage(store) {
-    Object.assign(this, { store, span: null });
+    this.store = store;
     this.#series = this.#wanted = null;
     this.#key = "";
   }
 
-  reset() {
-    this.span = null;
-    this.changed();
-  }
-
-  /** Magnifies the time axis by `factor` around `tick`, or around the current tick. */
-  zoom(factor, tick = this.#at) {
-    if (!this.store) return;
-    const [from, to] = this.#span, whole = this.#whole, wide = Math.max((to - from) / factor, FEWEST);
-    const share = to > from ? Math.min(Math.max((tick - from) / (to - from), 0), 1) : 0.5;
-    this.span = wide >= whole[1] - whole[0] ? null : within([tick - share * wide, tick + (1 - share) * wide], whole);
-    this.changed();
-  }
-
-  #shift(share) {
-    if (!this.span) return;
-    const by = share * (this.span[1] - this.span[0]);
-    this.span = within(this.span.map((tick) => tick + by), this.#whole);
-    this.changed();
-  }
-
-  get #whole() { return [this.store.first, Math.max(this.store.last, this.store.first + 1)]; }
-  get #span() { return this.span ?? this.#whole; }
+  /** The first and the last tick; never the same one. */
+  get #span() { return [this.store.first, Math.max(this.store.last, this.store.first + 1)]; }
 
   /** Returns the inner width of a strip. */
   get #wide() { return this.wide / this.#columns - LEFT - RIGHT; }
@@ -154,46 +108,27 @@ export class Charts {
   /** Draws the charts of `pair`, the curves only if they have changed, and the cursor. */
   draw(store, view, pair) {
     if (!this.box.open) return;
-    if (this.#at !== view.tick && this.span && (view.tick < this.span[0] || view.tick > this.span[1])) {
-      const half = (this.span[1] - this.span[0]) / 2;
-      this.span = within([view.tick - half, view.tick + half], this.#whole);
-    }
-    this.#at = view.tick;
     const title = store.stage.robots.length > pair.length ? `Charts of ${pair.map((robot) => robot.id).join(" and ")}` : "Charts";
     if (this.#summary.textContent !== title) this.#summary.textContent = title;
     const robots = pair.filter((robot) => view.truth || !view.focus || robot.id === view.focus);
     this.#want(store, robots);
-    const scale = unit(), ratio = (window.devicePixelRatio || 1) * scale;
-    this.wide = this.canvas.clientWidth / scale;
+    const size = extent(this.canvas), of = palette();
+    this.wide = size.wide;
     this.tall = window.innerHeight < LOW ? FLAT : TALL;
     this.#columns = this.wide >= TWO_COLUMNS ? 2 : 1;
     const rows = STRIPS.length / this.#columns, tall = rows * (TOP + this.tall) + (rows - 1) * (GAP - TOP) + AXIS;
-    const style = getComputedStyle(document.documentElement), of = (name) => style.getPropertyValue(`--${name}`).trim();
-    const look = [this.wide, this.tall, ratio, of("paper"), this.#span, view.truth, robots.map(({ id, role }) => id + role), this.#key, this.#failed].join();
+    const look = [this.wide, this.tall, size.ratio, of("paper"), this.#span, view.truth, robots.map(({ id, role }) => id + role), this.#key, this.#failed].join();
     if (look !== this.#drawn) {
       this.#drawn = look;
-      for (const canvas of [this.canvas, this.cursor]) {
-        canvas.style.height = `${Math.round(tall * scale)}px`;
-        canvas.width = Math.round(this.wide * ratio);
-        canvas.height = Math.round(tall * ratio);
-      }
-      this.#curves(this.#pen(this.canvas, ratio, tall, of), store, robots, view.truth, of);
+      for (const canvas of [this.canvas, this.cursor]) resize(canvas, size, tall);
+      this.#curves(fresh_pen(this.canvas, size.ratio, of), store, robots, view.truth, of);
     }
-    this.#now(this.#pen(this.cursor, ratio, tall, of), store, view, robots, of);
+    this.#now(fresh_pen(this.cursor, size.ratio, of), store, view, robots, of);
   }
 
-  #pen(canvas, ratio, tall, of) {
-    const pen = canvas.getContext("2d");
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.clearRect(0, 0, this.wide, tall);
-    pen.font = `11px ${of("font")}`;
-    return pen;
-  }
-
-  /** Reads the series of the visible ticks if they have changed; while a mission runs, at most once in #pause_ms. */
+  /** Reads the series if it has changed; while a mission runs, at most once in #pause_ms. */
   #want(store, robots) {
-    const [from, to] = this.span ? [Math.max(Math.floor(this.span[0]) - 1, store.first), Math.ceil(this.span[1]) + 1] : [store.first, store.last];
-    const ids = robots.map((robot) => robot.id), where = [store.name, ...ids, from, this.span ? to : "last"].join("/");
+    const ids = robots.map((robot) => robot.id), where = [store.name, ...ids].join("/");
     const key = `${where}/${store.last}/${store.revision}/${store.live}`;
     const recent = store.live && this.#wanted?.where === where && performance.now() - this.#read_ms < this.#pause_ms;
     if (recent) this.#again(this.#pause_ms);
@@ -201,7 +136,7 @@ export class Charts {
     this.#wanted = { key, where };
     this.#reading = true;
     this.#read_ms = performance.now();
-    data.series(store.name, ids, from, Math.min(to, store.last)).catch(() => null).then((series) => {
+    data.series(store.name, ids).catch(() => null).then((series) => {
       this.#reading = false;
       this.#pause_ms = Math.max(REFRESH_MS, 10 * (performance.now() - this.#read_ms)); // a long mission takes the server longer
       this.#failed = !series;
@@ -251,7 +186,7 @@ export class Charts {
       pen.fillText(this.#title(strip, store, truth), LEFT, -5);
       pen.fillStyle = of("grid");
       pen.fillRect(LEFT, 0, this.#wide, this.tall);
-      const values = curves.flatMap(({ low, high }) => [...this.#visible(low), ...this.#visible(high)]);
+      const values = curves.flatMap(({ low, high }) => [...low, ...high]).filter((value) => value !== null);
       if (values.length) this.#strip(pen, strip, curves, values, of);
       else {
         pen.fillStyle = of("ink");
@@ -259,7 +194,7 @@ export class Charts {
         const text = this.#series ? strip.none : this.#failed ? "the series cannot be read" : "reading ...";
         pen.fillText(text, LEFT + this.#wide / 2, this.tall / 2 + 4);
       }
-      if (top + this.tall + GAP > (STRIPS.length / this.#columns) * (this.tall + GAP)) this.#ticks(pen, of("faint"));
+      if (top + this.tall + GAP > (STRIPS.length / this.#columns) * (this.tall + GAP)) this.#numbers(pen, of("faint"));
       pen.restore();
     }
   }
@@ -269,12 +204,6 @@ export class Charts {
     if (!band) return title;
     if (this.#series?.exact) return truth ? "error (exact sensors: no sigma)" : "exact sensors: no sigma";
     return truth ? title : store.has_truth ? "3 sigma" : "3 sigma (no ground truth)";
-  }
-
-  /** Returns the values of the bins in the visible ticks. */
-  #visible(values) {
-    const { first, step } = this.#series, [from, to] = this.#span;
-    return values.filter((value, i) => value !== null && first + (i + 1) * step > from && first + i * step <= to);
   }
 
   #strip(pen, strip, curves, values, of) {
@@ -345,15 +274,9 @@ export class Charts {
     return this.#x((begin + Math.min(begin + step - 1, last)) / 2);
   }
 
-  #ticks(pen, colour) {
-    const [from, to] = this.#span, raw = ((to - from) * 60) / this.#wide, power = 10 ** Math.floor(Math.log10(Math.max(raw, 1)));
-    const every = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;
+  #numbers(pen, colour) {
     pen.fillStyle = colour;
-    for (let k = Math.ceil(from / every) * every; k <= to; k += every) {
-      const x = this.#x(k), end = LEFT + this.#wide;
-      pen.textAlign = x < LEFT + 12 ? "left" : x > end - 12 ? "right" : "center";
-      pen.fillText(String(k), x, this.tall + 12);
-    }
+    number_ticks(pen, ...this.#span, (tick) => this.#x(tick), this.tall + 12, 60);
   }
 
   /** Draws the cursor and the values of its bin above each strip. */
@@ -404,8 +327,7 @@ function joined(values) {
 
 /** Returns a scale with 0 in its middle. */
 function both_sides({ least, most }) {
-  const size = Math.max(-least, most, LEAST_M), power = 10 ** Math.floor(Math.log10(size));
-  const high = [1, 2, 3, 5, 10].map((factor) => factor * power).find((one) => one >= size);
+  const high = rounded_up(Math.max(-least, most, LEAST_M), STEPS);
   return { low: -high, high, marks: [-high, 0, high], unit: " m" };
 }
 
@@ -414,12 +336,6 @@ function decades({ least, most }) {
   const high = 10 ** Math.ceil(Math.log10(Math.max(most, 10 * LEAST_M)));
   const low = Math.min(10 ** Math.floor(Math.log10(Math.max(least, LEAST_M))), high / 10);
   return { low, high, marks: [low, high], log: true };
-}
-
-/** Moves a span into the bounds, and keeps its width if it fits. */
-function within([from, to], [first, last]) {
-  const by = Math.max(first - from, 0) || Math.min(last - to, 0);
-  return [Math.max(from + by, first), Math.min(to + by, last)];
 }
 
 /** Returns the stretches [from, to] of consecutive places with values. */

@@ -40,10 +40,10 @@ const answered = (answer) => answer.json().catch(() => ({ error: `the server ref
 /** True if the page has a server. */
 export const served = !recording;
 
-/** Returns the numbers of `robots` over time from tick `from` to `to`; a file has those of the whole mission. */
-export async function series(name, robots, from, to) {
+/** Returns the numbers of `robots` over time. */
+export async function series(name, robots) {
   if (recording) return { ...recording.series, robots: recording.series.robots.filter((one) => robots.includes(one.robot)) };
-  const fields = new URLSearchParams([["from", from], ["to", to], ...robots.map((robot) => ["robot", robot])]);
+  const fields = new URLSearchParams(robots.map((robot) => ["robot", robot]));
   return asked(`${of(name)}/series?${fields}`);
 }
 

@@ -11,7 +11,6 @@ import { embedded, on_clock, pass_on, tell, tell_state } from "./embedding.js";
 import { needed, release_focus } from "./focus.js";
 import { group_marks } from "./group.js";
 import { Guide } from "./guide.js";
-import { fill_help } from "./help.js";
 import { Legend } from "./legend.js";
 import { Log } from "./log.js";
 import { list_missions, state_of } from "./missions.js";
@@ -24,7 +23,7 @@ import { SPEEDS, USUAL } from "./speeds.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
 import { joined } from "./tints.js";
-import { plural, seconds } from "./words.js";
+import { KEYS, plural, seconds } from "./words.js";
 
 const RESULTS = "#results"; // the address of the table and the figures of an estimate
 const SETTLED_MS = 200; // after the last movement of the camera
@@ -483,7 +482,7 @@ $("near").addEventListener("click", () => plane.near(store, view));
 $("help").addEventListener("click", () => $("keys").showModal());
 $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
-fill_help($("key-list"), $("signs"));
+$("key-list").append(...KEYS.flatMap(([key, action]) => [make("dt", {}, make("kbd", { textContent: key })), make("dd", { textContent: action })]));
 
 window.addEventListener("hashchange", () => {
   const { show, tick, robot, selected, view: look, truth } = address_state();

@@ -3,8 +3,6 @@
 
 import * as data from "./data.js";
 
-const COUNTERS = ["anchor", "mutual", "sent", "heard", "refused", "lost", "bytes"];
-
 export class Store {
   constructor(name, mission, changed) {
     this.name = name;
@@ -18,12 +16,10 @@ export class Store {
     this.revision = 0;
     this.onforget = () => {};
     this.#changed = changed;
-    this.#counts = mission.stage.robots.map(() => []);
     this.#fill();
   }
 
   #changed;
-  #counts;
   #whole = 0;
   #wake = null;
   #failed = 0;
@@ -112,7 +108,6 @@ export class Store {
     const mission = await data.mission(this.name);
     this.stage = mission.stage;
     this.places = new Map(mission.stage.robots.map((robot, place) => [robot.id, place]));
-    this.#counts = mission.stage.robots.map(() => []);
     this.#forget(0);
     this.onstage?.();
   }
@@ -125,7 +120,6 @@ export class Store {
     }
     this.#whole = Math.min(this.#whole, from);
     this.onforget(from);
-    for (const counts of this.#counts) counts.length = Math.min(counts.length, from);
   }
 
   #advance() {
@@ -162,30 +156,6 @@ export class Store {
       }
       if (this.live) await new Promise((resolve) => setTimeout(resolve, 50));
     }
-  }
-
-  /** Returns the totals of `robot` up to `tick`; null until all earlier ticks are loaded. */
-  counted(robot, tick) {
-    if (tick >= this.#whole) return null;
-    const place = this.places.get(robot), counts = this.#counts[place];
-    for (let k = counts.length; k <= tick; k++) {
-      const before = counts[k - 1] ?? Object.fromEntries(COUNTERS.map((name) => [name, 0]));
-      const scene = this.scenes[k], player = scene?.players[place], now = { ...before };
-      if (player) {
-        now.anchor += (player.anchor_range !== undefined ? 1 : 0) + (player.anchors?.length ?? 0);
-        const ranged = player.contacts?.filter((contact) => contact[1] !== null).length ?? 0;
-        now.mutual += this.stage.team ? ranged : Math.min(ranged, 1);
-        now.sent += player.sent ? 1 : 0;
-        now.bytes += player.sent?.bytes ?? 0;
-        for (const passage of scene.passages) {
-          if (passage.receiver === robot && passage.what === "heard") now.heard += 1;
-          if (passage.receiver === robot && passage.what === "damaged") now.refused += 1;
-          if (passage.sender === robot && passage.what === "lost") now.lost += 1;
-        }
-      }
-      counts[k] = now;
-    }
-    return counts[tick];
   }
 }
 

@@ -1,6 +1,7 @@
 // The timeline: one band of phases per robot with the numbers of its hypotheses, contact shaded, and marks above for contacts, verdicts, and processes that end and return.
 
 import { unit } from "./pen.js";
+import { dragged, extent, fresh_pen, number_ticks, palette, resize } from "./strip.js";
 import { SIGNS } from "./words.js";
 
 const MARKED = Object.fromEntries(["contact", "claim", "inconsistent", "undecided", "down", "back"].map((kind) => [kind, SIGNS[kind]]));
@@ -15,21 +16,12 @@ export class Timeline {
     this.canvas = canvas;
     this.scrub = scrub;
     this.box = box;
-    let held = false;
-    const there = (event) => {
+    dragged(box, (event, began) => {
       const { left, width } = canvas.getBoundingClientRect(), inset = this.inset * unit();
       const share = (event.clientX - left - inset) / Math.max(width - inset - 6, 1);
       go(Math.round(Math.min(Math.max(share, 0), 1) * Math.max(this.last, 0)));
-    };
-    box.addEventListener("pointerdown", (event) => {
-      if (event.target === scrub) return;
-      held = true;
-      box.setPointerCapture(event.pointerId);
-      there(event);
-      scrub.focus({ preventScroll: true });
-    });
-    box.addEventListener("pointermove", (event) => { if (held) there(event); });
-    for (const name of ["pointerup", "pointercancel"]) box.addEventListener(name, () => { held = false; });
+      if (event === began) scrub.focus({ preventScroll: true });
+    }, ({ target }) => target !== scrub);
     scrub.addEventListener("input", () => go(Number(scrub.value)));
   }
 
@@ -95,23 +87,15 @@ export class Timeline {
       const chosen = store.chosen(focus);
       shown = robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
     }
-    const style = getComputedStyle(document.documentElement), of = (name) => style.getPropertyValue(`--${name}`).trim();
-    const ratio = (window.devicePixelRatio || 1) * unit(), wide = canvas.clientWidth / unit();
+    const of = palette(), size = extent(canvas), { wide, ratio } = size;
     const band = shown.length > 3 ? 9 : 14, tall = MARKS + shown.length * (band + 3) + 15;
-    const height = `${Math.round(tall * unit())}px`;
-    if (canvas.style.height !== height) canvas.style.height = height;
-    if (canvas.width !== Math.round(wide * ratio) || canvas.height !== Math.round(tall * ratio)) {
-      canvas.width = Math.round(wide * ratio);
-      canvas.height = Math.round(tall * ratio);
-    }
-    const visible = canvas.getContext("2d"), now = Math.min(tick + (moving ? share : 0), this.last);
+    resize(canvas, size, tall);
+    const now = Math.min(tick + (moving ? share : 0), this.last);
     const key = [store.name, store.revision, this.read, this.last, focus, wide, tall, ratio, of("paper"), shown.map(({ id }) => id)].join();
-    if (key !== this.#key) this.#bands(this.#pen(ratio, wide, tall, of, shown), shown, band, wide, of, store);
+    if (key !== this.#key) this.#bands(this.#pen(ratio, of, shown), shown, band, wide, of, store);
     this.#key = key;
-    visible.setTransform(1, 0, 0, 1, 0, 0);
-    visible.clearRect(0, 0, canvas.width, canvas.height);
-    if (canvas.width && canvas.height) visible.drawImage(this.#drawn, 0, 0);
-    visible.setTransform(ratio, 0, 0, ratio, 0, 0);
+    const visible = fresh_pen(canvas, ratio, of);
+    if (canvas.width && canvas.height) visible.drawImage(this.#drawn, 0, 0, canvas.width / ratio, canvas.height / ratio);
     this.#hand(visible, this.#x(now, wide), tall, of);
     this.#limit();
     if (this.scrub.value !== String(tick)) this.scrub.value = String(tick);
@@ -125,11 +109,9 @@ export class Timeline {
   #x(k, wide) { return this.inset + (k / Math.max(this.last, 1)) * (wide - this.inset - 6); }
 
   /** Returns the pen of all but the hand, which stays the same while time passes. */
-  #pen(ratio, wide, tall, of, shown) {
+  #pen(ratio, of, shown) {
     Object.assign(this.#drawn, { width: this.canvas.width, height: this.canvas.height });
-    const pen = this.#drawn.getContext("2d");
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.font = `11px ${of("font")}`;
+    const pen = fresh_pen(this.#drawn, ratio, of);
     this.inset = 12 + Math.max(...shown.map((robot) => pen.measureText(robot.id).width));
     return pen;
   }
@@ -178,7 +160,8 @@ export class Timeline {
       }
     });
     this.#signs(pen, x, of, ids, wide);
-    this.#ticks(pen, x, MARKS + shown.length * (band + 3) + 11, of("faint"), wide);
+    pen.fillStyle = of("faint");
+    number_ticks(pen, 0, this.last, x, MARKS + shown.length * (band + 3) + 11, 70);
   }
 
   /** Draws the hand at the current time. */
@@ -214,16 +197,6 @@ export class Timeline {
   /** Lets the slider move up to the last tick. */
   #limit() {
     if (this.scrub.max !== String(this.last)) this.scrub.max = String(this.last);
-  }
-
-  #ticks(pen, x, y, colour, wide) {
-    const raw = (this.last * 70) / Math.max(wide, 1), power = 10 ** Math.floor(Math.log10(Math.max(raw, 1)));
-    const unit = [1, 2, 5, 10].find((factor) => factor * power >= raw) * power;
-    pen.fillStyle = colour;
-    for (let k = 0; k <= this.last; k += unit) {
-      pen.textAlign = k === 0 ? "left" : x(k) > wide - 20 ? "right" : "center";
-      pen.fillText(String(k), k === 0 ? x(0) : x(k), y);
-    }
   }
 }
 
