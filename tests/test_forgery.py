@@ -73,6 +73,7 @@ def told(received: ReceivedMission) -> dict[str, Any]:
         "ticks": repr(known.ticks),
         "end": known.end,
         "last": known.last,
+        "farewells": known.final_reports,
     }
 
 
