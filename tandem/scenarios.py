@@ -36,10 +36,10 @@ class Scenario(msgspec.Struct, frozen=True):
     <Scenario random, seed 7: a, b>
     >>> scenario.table["mission"]["period"]
     0.5
-    >>> scenario.with_({"mission.perid": 0.5})
+    >>> scenario.with_({"mission.tick": 0.5})
     Traceback (most recent call last):
     ...
-    compose.errors.BadScenario: random: 'mission.perid': mission has no field 'perid'; did you mean 'period'?
+    compose.errors.BadScenario: random: 'mission.tick': mission: unknown field 'tick'
     """
 
     table: dict[str, Any]

@@ -78,7 +78,11 @@ rows = [
         ("paired = true", 'labels = ["x"]', "axis[0].labels: an axis with 'rows' has none"),
         ('"as told"', '"a is biased"', "axis[0].rows[2].label: equal to that of rows[0]"),
         ('label = "as told", ', "", "axis[0].rows[0]: missing field 'label'"),
-        ("noise.outliers", "noise.outlier", "axis[0].rows[1].set: 'world.noise.outlier': world.noise has no"),
+        (
+            "noise.outliers",
+            "noise.outlier",
+            "axis[0].rows[1].set: 'world.noise.outlier': world.noise: unknown field",
+        ),
         (
             'outliers" = 0.1',
             'outliers" = nan',
@@ -89,7 +93,11 @@ rows = [
             '"world.noise" = {}',
             "axis[0].rows[2].set: 'world.noise' is already set by",
         ),
-        ('"mission.accuracy" = 0.2', '"mission.acuracy" = 1', "set: 'mission.acuracy': mission has no field"),
+        (
+            '"mission.accuracy" = 0.2',
+            '"mission.acuracy" = 1',
+            "set: 'mission.acuracy': mission: unknown field",
+        ),
         ('outliers" = 0.1', 'outliers" = 1.0', "cell 1 (sensors = 10 % outliers): world.noise.outliers: "),
     ],
 )
@@ -126,13 +134,12 @@ MISTAKES = {
         **{
             field: f"axis[0].field: '{field}': {why}"
             for field, why in {
-                "robot.b.anker": "robot[1] has no field 'anker'",
+                "robot.b.anker": "robot[1]: unknown field 'anker'",
                 "robot.c.anchor": "the base scenario has no robot",
-                "robot[2].anchor": "the base scenario has no",
-                "mission.noise.odometry.w": "mission.noise.odometry has no field 'w'",
-                "mission.noise.outlier_bias[0]": "the base scenario has no mission.noise.out",
+                "robot[2].anchor": "robot[2]: missing field 'id'",
+                "mission.noise.odometry.w": "mission.noise.odometry: unknown field 'w'",
                 "robot..anchor": "not a path",
-                "mission.period.x": "mission.period is a single",
+                "mission.period.x": "mission.period of the base scenario is not a table",
             }.items()
         },
     },
@@ -151,7 +158,7 @@ MISTAKES = {
         AXIS + '\nname = "rate"\nlabels = ["x", "y"]': "axis: 2 columns would have the name 'rate'",
         JOINT.replace('name = "both"', ""): "axis[0].name: missing",
         JOINT.replace("[0.5, 1.0]", "[0.5]"): "axis[0].values[1]: must be a list of 2 values",
-        JOINT.replace("n.period", "n.perod"): "axis[0].fields[0]: 'mission.perod': mission has no",
+        JOINT.replace("n.period", "n.perod"): "axis[0].fields[0]: 'mission.perod': mission: unknown",
     },
 }
 """The text of BOTH that is replaced, its replacement, and the error that follows."""

@@ -5,15 +5,14 @@ from __future__ import annotations
 import copy
 import re
 from collections.abc import Mapping, Sequence
-from functools import cache
 from itertools import pairwise
 from typing import Any
 
 import msgspec
-from msgspec import inspect
 
 from compose.errors import NoSuchField
 from compose.scenario.scenario_tables import ScenarioFile
+from compose.scenario.toml_file import field_first
 from protocol.spelling import did_you_mean
 
 Steps = tuple[str | int, ...]
@@ -36,45 +35,44 @@ def steps(path: str, base: Mapping[str, Any]) -> Steps:
 
 
 def field_steps(path: str, base: Mapping[str, Any]) -> Steps:
-    """Return the parsed `path`, checked against the scenario schema and the table `base`.
+    """Return the parsed `path` of a field that a scenario file with the content `base` has, or could have.
 
-    The field may be missing in `base` if the schema has it. Raises NoSuchField.
+    Raises NoSuchField.
     """
-    kind = _schema()
     value: Any = base
     walked: list[str | int] = []
-    for step in _split(path):
-        so_far = _written(walked)
-        match _bare(kind):
-            case inspect.StructType(fields=fields):
-                kinds = {field.encode_name: field.type for field in fields}
-                if value is not None and not isinstance(value, Mapping):
-                    raise NoSuchField(f"{so_far} of the base scenario is not a table")
-                if step not in kinds:
-                    near = did_you_mean(str(step), kinds)
-                    raise NoSuchField(f"{so_far or 'a scenario'} has no field '{step}'{near}")
-                kind = kinds[str(step)]
-                value = value.get(step) if value is not None else None
-            case inspect.DictType(value_type=kind):
-                value = value.get(step) if isinstance(value, Mapping) else None
-            case inspect.ListType() | inspect.TupleType() | inspect.VarTupleType() as many:
-                listed = value if isinstance(value, Sequence) else ()
-                spare = not isinstance(many, inspect.TupleType) and _may_be_empty(many.item_type)
-                place = _place(step, listed, so_far, spare=spare)
-                kind = many.item_types[place] if isinstance(many, inspect.TupleType) else many.item_type
-                value = listed[place] if place < len(listed) else None
-                walked.append(place)
-                continue
-            case _:
-                raise NoSuchField(f"{so_far} is a single value")
+    for name in _split(path):
+        tables = value if isinstance(value, list) and value and isinstance(value[0], Mapping) else ()
+        step = _place(name, tables, _written(walked)) if isinstance(name, str) and tables else name
+        if value is not None and not isinstance(value, list if isinstance(step, int) else Mapping):
+            what = "list" if isinstance(step, int) else "table"
+            raise NoSuchField(f"{_written(walked)} of the base scenario is not a {what}")
         walked.append(step)
+        value = _inner(value, step)
+        if isinstance(step, int) and value is None:
+            _check(base, walked, {})  # a table may be added to a list if it needs no fields, as a fault
+    _check(base, walked, _ANY)
     return tuple(walked)
 
 
-@cache
-def _schema() -> inspect.Type:
-    """Return the types of all fields of a scenario file, whose translation takes longer than a mission."""
-    return inspect.type_info(ScenarioFile)
+_ANY = object()
+"""A value that no field has: its type is refused only where there is a field."""
+
+
+def _check(base: Mapping[str, Any], walked: Sequence[str | int], value: object) -> None:
+    """Raise NoSuchField if a field of `base` with that path is unknown, or its table lacks others."""
+    try:
+        msgspec.convert(with_value(base, tuple(walked), value), ScenarioFile)
+    except msgspec.ValidationError as error:
+        if re.match("Object (contains unknown field|missing required field .* - at )", str(error)):
+            raise NoSuchField(field_first(str(error), ScenarioFile)) from None
+
+
+def _inner(value: Any, step: str | int) -> Any:
+    """Return the value at `step` of a table or a list; None if it is missing."""
+    if isinstance(step, str):
+        return value.get(step) if value is not None else None
+    return value[step] if value is not None and step < len(value) else None
 
 
 def with_value(table: Mapping[str, Any], way: Steps, value: Any) -> dict[str, Any]:
@@ -114,34 +112,8 @@ def _written(walked: Sequence[str | int]) -> str:
     return "".join([f"[{step}]" if isinstance(step, int) else f".{step}" for step in walked]).lstrip(".")
 
 
-def _bare(kind: inspect.Type) -> inspect.Type:
-    """Return the type of a field without constraints and without None."""
-    if isinstance(kind, inspect.Metadata):
-        return _bare(kind.type)
-    if isinstance(kind, inspect.UnionType):
-        left = [one for one in kind.types if not isinstance(one, inspect.NoneType)]
-        return _bare(left[0]) if len(left) == 1 else kind
-    return kind
-
-
-def _may_be_empty(kind: inspect.Type) -> bool:
-    """Return true if the type is a table without required fields, such as a fault.
-
-    A list can be extended by an empty table of such a type.
-    """
-    bare = _bare(kind)
-    return isinstance(bare, inspect.StructType) and not any(field.required for field in bare.fields)
-
-
-def _place(step: str | int, listed: Sequence[Any], so_far: str, *, spare: bool) -> int:
-    """Return the index of `step` in the list `listed`: the index itself, or that of the table with that id.
-
-    An index beyond the end is valid only if `spare`. Raises NoSuchField.
-    """
-    if isinstance(step, int):
-        if step >= len(listed) and not spare:
-            raise NoSuchField(f"the base scenario has no {so_far}[{step}]")
-        return step
+def _place(step: str, listed: Sequence[Any], so_far: str) -> int:
+    """Return the index of the table with the id `step` in a list. Raises NoSuchField."""
     ids = [one.get("id") if isinstance(one, Mapping) else None for one in listed]
     if step not in ids:
         near = did_you_mean(step, [one for one in ids if isinstance(one, str)])
