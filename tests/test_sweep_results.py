@@ -135,9 +135,10 @@ def test_a_narrow_terminal_shows_all_outcomes_and_breaks_no_word_and_no_command(
     result = lines[next(i for i, line in enumerate(lines) if line.startswith("narrow: ")) :]
     assert [line for line in result if line != command and len(line) > columns] == []
     text = " ".join(" ".join(result).split())
-    counts = "2 trials, 0 localised, 2 undecided, 0 inconsistent, 0 wrong, 0 failed"
-    assert f"cell 0, max_ticks 9, name assured: {counts}; rate 0.0000 (0.0000 to 0.6576) cell 1" in text
-    assert "2 localised, 0 undecided, 0 inconsistent, 0 wrong, 0 failed; rate 1.0000 (0.3424 to" in text
+    counts = "trials 2; localised 0; undecided 2; inconsistent 0; wrong 0; failed 0"
+    rate = "rate 0.0000; rate_low 0.0000; rate_high 0.6576"
+    assert f"cell 0, max_ticks 9, name assured: {counts}; {rate}; p50 -" in text
+    assert "localised 2; undecided 0; inconsistent 0; wrong 0; failed 0; rate 1.0000; rate_low 0.3424" in text
     assert "\n\n\n" not in "\n".join(result)
     assert "(max_ticks: a, b not localised by then); to run it again:" in text
 

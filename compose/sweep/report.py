@@ -48,7 +48,7 @@ OF_ATTACKED_GROUP = ("found",)
 """The additional column of sweeps of groups with an attacker."""
 OF_NOISE = ("within", "nees", "nees low", "nees high")
 """The additional columns of sweeps in which robots claim covariances."""
-OF_DIFFERENCES = ("both", "ticks", "low", "high", "rate %", "low", "high")
+OF_DIFFERENCES = ("both", "ticks", "low", "high", "rate %", "low %", "high %")
 """The columns of the table of differences, after the names of the cells."""
 DIFFERENCES_NOTE = (
     "both: trials that localised in both cells, of all with the same draws; ticks: mean difference of these; "
@@ -190,30 +190,13 @@ def _refused(results: Results) -> Iterator[str]:
 
 
 def _lines(results: Results) -> tuple[list[str], Sequence[str]]:
-    """Return the lines of the widest table that fits the terminal, and its columns.
-
-    If none fits, they are those of a list, with a sentence for each cell.
-    """
+    """Return the lines of the widest table that fits the terminal, and its columns."""
     names = ["cell", *[axis.name.rpartition(".")[2] for axis in results.sweep.axes]]
     rows = []
     for cell in _shown(results):
         axes = [axis.label(i) for axis, i in zip(results.sweep.axes, cell.place, strict=True)]
         rows.append(([str(cell.index), *axes], _figures(results.figures[cell.index])))
-    for columns in _choices(results):
-        cells = [[*place, *[texts[column] for column in columns]] for place, texts in rows]
-        lines = tables.lines(tables.table(names, columns, cells))
-        if tables.fits(lines):
-            return lines, columns
-    found: list[str] = []
-    for place, texts in rows:
-        sentence = ", ".join([" ".join(one) for one in zip(names, place, strict=True)])
-        sentence += f": {', '.join([f'{texts[one]} {one}' for one in ('trials', *OUTCOME_COLUMNS)])}"
-        if texts["rate"] != NO_VALUE:
-            sentence += f"; rate {texts['rate']} ({texts['rate_low']} to {texts['rate_high']})"
-        if texts["p50"] != NO_VALUE:
-            sentence += f"; ticks p50 {texts['p50']}, p95 {texts['p95']}, max {texts['max']}"
-        found += text_width.wrapped(sentence, 2)
-    return found, ("rate_low", "p50")
+    return tables.widest(names, _choices(results), rows)
 
 
 def _shown(results: Results) -> list[Cell]:

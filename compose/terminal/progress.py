@@ -26,10 +26,10 @@ TABLE_NOTES = (
 """The footnotes, each with its column."""
 RESULT_COLUMNS = (TICK_COLUMN, TRUTH, TRUTH_AT_CLAIM, ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE)
 """All columns: in a group, robots drive on after their claims; SIGMA and LATE are not shown if empty."""
-NARROWER: tuple[tuple[str, ...], ...] = ((), (TRUTH, TRUTH_AT_CLAIM), (ESTIMATE,), (RANGES, REPORTS))
+NARROWER: tuple[tuple[str, ...], ...] = ((TRUTH, TRUTH_AT_CLAIM), (ESTIMATE,), (RANGES, REPORTS))
 """The columns that are left out one after the other until the table fits."""
 MOST_ROBOTS_AS_LIST = 4
-"""The largest number of robots that are shown as a list if the table of all columns does not fit."""
+"""The largest number of robots of which all columns are shown, as a list if the table does not fit."""
 MOST_NAMED_ROBOTS = 10
 """The largest number of robots named in a sentence."""
 
@@ -45,17 +45,11 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
     omitted |= {TICK_COLUMN, TRUTH_AT_CLAIM} if group is None else {TRUTH}
-    for narrower in NARROWER:
-        omitted |= {*narrower}
-        columns = [column for column in RESULT_COLUMNS if column not in omitted]
-        cells = {name: _cells(robot, columns) for name, robot in robots.items()}
-        rows = [(name, *of_robot.values()) for name, of_robot in cells.items()]
-        made = tables.table(["robot"], columns, rows)
-        if len(robots) <= MOST_ROBOTS_AS_LIST or tables.fits(tables.lines(made)):
-            lines = tables.shown(["robot"], columns, rows)
-            break
-    else:
-        lines = tables.lines(made, text_width.room())
+    choices = [[column for column in RESULT_COLUMNS if column not in omitted]]
+    for narrower in NARROWER if len(robots) > MOST_ROBOTS_AS_LIST else ():
+        choices.append([column for column in choices[-1] if column not in narrower])
+    rows = [([name], _cells(robot)) for name, robot in robots.items()]
+    lines, columns = tables.widest(["robot"], choices, rows)
     tell(f"{summary['scenario']}: {outcome_line(summary)}")
     say("", *lines, "", *text_width.notes(TABLE_NOTES, columns))
     if group is not None:
@@ -106,9 +100,9 @@ def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
     return f"deadlines missed, of {ticks}: {names}; a lower --rate{slower} gives each robot more time"
 
 
-def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
+def _cells(robot: Mapping[str, Any]) -> dict[str, str]:
     """Return the cells of the robot's row, by column."""
-    cells = {
+    return {
         TRUTH: _pose(robot["truth"]),
         TICK_COLUMN: _number(robot["localised_tick"]),
         TRUTH_AT_CLAIM: _pose(robot.get("truth_at_claim")),
@@ -119,7 +113,6 @@ def _cells(robot: Mapping[str, Any], columns: Sequence[str]) -> dict[str, str]:
         REPORTS: f"{_number(robot['reports_sent'])} / {_number(robot['reports_heard'])}",
         LATE: _number(robot["deadlines_missed"]),
     }
-    return {column: cells[column] for column in columns}
 
 
 def _pose(pose: list[float] | None) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from rich.box import SIMPLE_HEAD
@@ -14,13 +14,16 @@ from rich.table import Table
 from compose.terminal.text_width import room, wrapped
 from protocol.output import UNLIMITED
 
+Texts = Mapping[str, str]
+"""The texts of a row by the headings of its columns."""
+
 
 def console(**options: Any) -> Console:
     """Return a console that prints text literally: `[red]` and `:smile:` are not markup."""
     return Console(markup=False, emoji=False, highlight=False, **options)
 
 
-def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> Table:
+def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str | None]]) -> Table:
     """Return a table with text in the columns `left`, and numbers, which are never broken, in `right`."""
     made = Table(box=SIMPLE_HEAD, pad_edge=False)
     for heading in left:
@@ -32,36 +35,31 @@ def table(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str
     return made
 
 
-def shown(left: Sequence[str], right: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table; if the terminal breaks a word of it, a list with an entry per row."""
-    if as_table := unbroken(left, right, rows):
-        return as_table
-    headings = [*left, *right][1:]
-    return [
-        line
-        for name, *cells in rows
-        for line in (
-            *wrapped(name),
-            *[
-                part
-                for pair in zip(headings, cells, strict=True)
-                for part in wrapped(f"  {': '.join(pair)}", 4)
-            ],
-        )
+def widest(
+    left: Sequence[str], choices: Sequence[Sequence[str]], rows: Sequence[tuple[Sequence[str], Texts]]
+) -> tuple[list[str], Sequence[str]]:
+    """Return the lines of a table with the first of the `choices` of right columns that fits the terminal.
+
+    The second value is that choice. If none fits, the lines are those of a list of the first one, with an
+    entry for each row. A row has the cells of the columns `left`, and those of the others by heading.
+    """
+    for columns in choices:
+        found = lines(table(left, columns, [(*cells, *map(texts.get, columns)) for cells, texts in rows]))
+        if max(map(cell_len, found), default=0) <= room():
+            return found, columns
+    entries = [
+        f"{', '.join(map(' '.join, zip(left, cells, strict=True)))}: "
+        f"{'; '.join([f'{one} {texts[one]}' for one in choices[0]])}"
+        for cells, texts in rows
     ]
+    return [line for entry in entries for line in wrapped(entry, 2)], choices[0]
 
 
-def unbroken(left: Sequence[str], right: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return the lines of a table as wide as the terminal; none if a word would be broken."""
-    found = lines(table(left, right, rows), room())
-    whole = {word for line in found for word in line.split()}
-    words = {word for cells in (left, right, *rows) for cell in cells for word in cell.split()}
-    return found if words <= whole else []
-
-
-def fits(lines: Iterable[str]) -> bool:
-    """Return whether all `lines` fit the width of the terminal."""
-    return max(map(cell_len, lines), default=0) <= room()
+def shown(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
+    """Return the lines of a table, or of a list if the terminal is too narrow; headings differ."""
+    first = len(left)
+    found = [(row[:first], dict(zip(right, row[first:], strict=True))) for row in rows]
+    return widest(left, [right], found)[0]
 
 
 def lines(made: Table, width: int = UNLIMITED) -> list[str]:
