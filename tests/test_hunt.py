@@ -6,7 +6,6 @@ import math
 import signal
 import tomllib
 from collections.abc import Callable
-from contextlib import suppress
 from itertools import zip_longest
 from pathlib import Path
 from typing import Any
@@ -27,7 +26,7 @@ from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.hunt import coverage, examination
+from compose.sweep.hunt import coverage, examination, invariants
 from compose.sweep.hunt.examination import MOST_TICKS, MOST_WITHOUT_END, examined, scenario_of, watched
 from compose.sweep.hunt.exploration import Hunt
 from compose.sweep.hunt.mutation import fault_lines, simpler
@@ -188,13 +187,19 @@ GUARDS = {"hypothesis", "definite covariance", "determined position"}
 """The conditions that no mission was found to reach. tests/test_claim.py has them."""
 
 
-def test_a_mission_is_given_up_that_lasts_long_and_need_not_localise() -> None:
+def test_a_mission_that_lasts_long_and_need_not_localise_is_examined_up_to_a_tick(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     table = scenario_table("random")
     table["robot"][1]["anchor"] = [100.0, 0.0]
     partition = {**table, "fault": [{"partition": True}]}
     assert MOST_TICKS > scenario_of(partition)[0].max_ticks > MOST_WITHOUT_END
-    assert examined(partition).refused == "it lasts too long"
-    assert examined(table).refused is None
+    result = examined(partition)
+    assert (result.breaches, result.refused, result.known.ticks) == ((), None, MOST_WITHOUT_END)
+    assert "orbiting/2/open: contact" in result.reached
+    monkeypatch.setattr(invariants, "TRUTH_M", 0.0)
+    assert [one.kind for one in examined(partition).breaches] == ["truth lost"]
+    assert 0 < examined(table).known.ticks < MOST_WITHOUT_END
 
 
 @pytest.mark.long
@@ -209,10 +214,9 @@ def test_every_task_condition_and_kind_of_message_is_reached_in_some_mission(
     for table in inputs:
         scenario, _, _ = scenario_of(table)
         if scenario.max_ticks * len(scenario.robots) <= MOST_TICKS:
-            with suppress(coverage.TooLongError):
-                sinks, messages = watched(scenario, seen)
-                run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
-                seen |= coverage.reached(run)[0]
+            sinks, messages, _ = watched(scenario, seen)
+            run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
+            seen |= coverage.reached(run)[0]
             left = coverage.never(seen)
         if not (left["tasks"] or left["messages"] or {*left["conditions"]} - GUARDS):
             break

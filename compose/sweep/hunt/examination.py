@@ -25,9 +25,9 @@ from world.scenario import Scenario
 MOST_TICKS = 120_000
 """The largest `max_ticks` of a mission, times its robots, that is run."""
 MOST_WITHOUT_END = 750
-"""The number of ticks after which a mission that need not localise its robots is given up.
+"""The number of ticks of a mission that need not localise its robots, at most, which are examined.
 
-A robot that waits for what was lost waits until `max_ticks`, and each restart replays all of it.
+A robot that waits for what was lost waits until `max_ticks`, and each restart would replay all of it.
 """
 
 
@@ -59,12 +59,10 @@ def examined(table: dict[str, Any]) -> Examined:
         return Examined(refused="it could last too long")
     seen: set[str] = set()
     try:
-        sinks, messages = watched(scenario, seen)
-    except TooLongError:
-        return Examined(refused="it lasts too long")
+        sinks, messages, is_cut = watched(scenario, seen)
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
-    again = _again(scenario, kills, clocks, sinks)
+    again = [] if is_cut else _again(scenario, kills, clocks, sinks)
     try:
         run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
         found, moments = reached(run)
@@ -77,17 +75,20 @@ def examined(table: dict[str, Any]) -> Examined:
     return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments), shares)
 
 
-def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal], EncodedMessages]:
-    """Return the journals of a run of `scenario` in this process, and its messages by their frames.
+def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal], EncodedMessages, bool]:
+    """Return the journals of a run of `scenario` in this process, its messages, and whether it is cut.
 
-    `seen` are the conditions not met.
+    It is cut after MOST_WITHOUT_END ticks if nothing must end it. `seen` are the conditions not met.
     """
     last = math.inf if guaranteed(scenario) else MOST_WITHOUT_END
     sinks, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
-    in_process.played(
-        scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen, last)), messages.encode
-    )
-    return sinks, messages
+    try:
+        in_process.played(
+            scenario, sinks, lambda config: cast(Any, WatchedPlanner(config, seen, last)), messages.encode
+        )
+    except TooLongError:
+        return sinks, messages, True
+    return sinks, messages, False
 
 
 def _task(run: Run, kill: Kill) -> str:

@@ -83,9 +83,7 @@ def blamed(run: Run) -> Iterator[Breach]:
 
 def unfinished(run: Run) -> Iterator[Breach]:
     """Every robot is localised in the end, with exact sensors, honest peers and a radio that delivers."""
-    if run.end is None:
-        yield Breach("unfinished", "the mission has no end")
-    elif run.end.outcome != "localised" and guaranteed(run.scenario):
+    if run.end is not None and run.end.outcome != "localised" and guaranteed(run.scenario):
         yield Breach("unfinished", f"tick {run.end.tick}: {run.end.outcome}: {run.end.causes}")
 
 

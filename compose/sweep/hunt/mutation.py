@@ -58,7 +58,7 @@ class Clues(msgspec.Struct, frozen=True):
 def seeds(source: str) -> list[Table]:
     """Return the inputs with which the hunt begins: `source`, then cells of the shipped sweeps of it.
 
-    Those with exact sensors and those with noisy ones take turns.
+    Those of few robots come first, since they take less time. Exact and noisy sensors take turns.
     """
     found = [scenario_table(source)]
     for name in spec.shipped():
@@ -67,7 +67,13 @@ def seeds(source: str) -> list[Table]:
             every = list(cells(sweep))
             found += [copy.deepcopy(dict(one.table)) for one in every[:: -(-len(every) // CELLS_OF_SWEEP)]]
     turn = {False: count(), True: count()}
-    return [found[0], *sorted(found[1:], key=lambda one: next(turn[is_noisy(one)]))]
+    return [found[0], *sorted(sorted(found[1:], key=_robots), key=lambda one: next(turn[is_noisy(one)]))]
+
+
+def _robots(table: Mapping[str, Any]) -> int:
+    """Return the number of robots of the input."""
+    drawn = table.get("group") or table.get("team") or {}
+    return int(drawn.get("robots", len(table.get("robot", ()))))
 
 
 def is_noisy(table: Mapping[str, Any]) -> bool:
@@ -80,13 +86,16 @@ def mutated(
     known: Clues,
     other: Mapping[str, Any],
     draw: random.Random,
-    changes: Sequence[Change] = (),
+    changes: Mapping[Change, float] | None = None,
 ) -> Table:
     """Return `table` with one to three of `changes`, or of all; parts of `other` may be taken."""
-    found, changes = copy.deepcopy(dict(table)), changes or list(MUTATIONS)
+    found, weights = copy.deepcopy(dict(table)), changes or MUTATIONS
     for _ in range(draw.choice((1, 1, 2, 3))):
-        [change] = draw.choices(changes, [MUTATIONS[one] for one in changes])
-        found = change(copy.deepcopy(found), known, draw) or found
+        changed = None
+        while changed is None:  # a change that has nothing to change would run the same input again
+            [change] = draw.choices(list(weights), list(weights.values()))
+            changed = change(copy.deepcopy(found), known, draw)
+        found = changed
     if draw.random() < 0.1:
         part = draw.choice(("fault", "kill", "seed"))
         if part in other:
@@ -320,8 +329,8 @@ MUTATIONS: Mapping[Change, float] = {
     _retimed: 1.5,
 }
 """The changes of an input, and how often each is drawn."""
-WITHIN_BOUNDS: Sequence[Change] = (_seed, _start, _geometry, _size)
-"""The changes after which the computed bounds still hold."""
+WITHIN_BOUNDS: Mapping[Change, float] = {_seed: 1.0, _start: 1.0, _geometry: 2.0, _size: 0.5}
+"""The changes after which the computed bounds still hold, and how often each is drawn to climb one."""
 
 
 def simpler(table: Table, source: Table) -> Iterator[Table]:
