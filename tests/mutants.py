@@ -1,19 +1,21 @@
 """Defects that a hunt must find: `python -m tests.mutants [NAME ...] [--cpu S]`.
 
 Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used S
-seconds of processor time: with the guide, and beside it by chance alone. A table says after how many seconds
-and runs each was found, and how small the input is.
+seconds of processor time: with the guide, and beside it by chance alone. The table in docs/howto-hunt.md has
+after how many runs and seconds each was found, and how small the input is; docs/reference.py writes it.
 """
 
 from __future__ import annotations
 
 import argparse
 import inspect
+import json
 import multiprocessing
 import os
 import sys
 import textwrap
 from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -29,9 +31,12 @@ from compose.scenario import group_meetings
 from compose.sweep.hunt.exploration import FoundBreach, Hunt
 from compose.sweep.hunt.mutation import fault_lines
 from protocol.journal.journal_file import Journal
+from tests.expected.tables import MUTANTS_FOUND
 from world import scenario, tick
 from world.hardware import bridge
 
+MISSED = "not in "
+"""The beginning of the result of a hunt that has not found the defect."""
 BUDGET_S = 600.0
 """The processor time in s of 5 minutes on two cores."""
 
@@ -197,9 +202,9 @@ def hunted(mutant: Callable[[], None], source: str, cpu_s: float, *, guided: boo
 
     found: FoundBreach | None = hunt.run(is_over)
     if found is None:
-        return f"not found in {hunt.runs} runs, {spent:.0f} s"
+        return f"{MISSED}{hunt.runs} runs, {spent:.0f} s"
     changes = fault_lines(found.table, hunt.seeds[0])
-    return f"found in run {found.runs}, after {spent:.0f} s; {changes} changes: {found.breach.kind}"
+    return f"run {found.runs}, {used():.0f} s: {found.breach.kind}, {changes} changes"
 
 
 def main(arguments: list[str]) -> int:
@@ -209,24 +214,18 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--cpu", type=float, default=BUDGET_S)
     parser.add_argument("--guided-only", action="store_true")
     options = parser.parse_args(arguments)
-    chosen = {one: source for one, source in MUTANTS.items() if one.__name__ in (options.name or _names())}
-    missed = 0
-    print("| mutant | guided | by chance |\n| --- | --- | --- |")
-    for mutant, source in chosen.items():
-        print(f"| {mutant.__name__}", end="", flush=True)
-        for guided in (True,) if options.guided_only else (True, False):
-            child, ours = os.pipe()
-            pid = os.fork()
-            if pid == 0:
-                os.write(ours, hunted(mutant, source, options.cpu, guided=guided).encode())
-                os._exit(0)
-            os.waitpid(pid, 0)
-            os.close(ours)
-            with os.fdopen(child) as text:
-                says = text.read()
-            missed += guided and not says.startswith("found")
-            print(f" | {says}", end="", flush=True)
-        print(" |", flush=True)
+    chosen = [one for one in MUTANTS if one.__name__ in (options.name or _names())]
+    rows, missed = json.loads(MUTANTS_FOUND.read_text()), 0
+    for mutant in chosen:
+        assert mutant.__doc__ is not None
+        row = rows[mutant.__doc__.removesuffix(".")] = {}
+        for head, guided in (("guided", True), ("by chance", False))[: 1 if options.guided_only else 2]:
+            with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as process:
+                done = process.submit(hunted, mutant, MUTANTS[mutant], options.cpu, guided=guided)
+                row[head] = done.result()
+            print(f"{mutant.__name__}, {head}: {row[head]}", flush=True)
+        missed += row["guided"].startswith(MISSED)
+        MUTANTS_FOUND.write_text(json.dumps(rows, indent=1) + "\n")
     return 0 if 10 * missed <= len(chosen) else 1
 
 

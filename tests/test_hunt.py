@@ -20,21 +20,24 @@ from compose.audit import rules
 from compose.cli import hunt as command
 from compose.cli.main import parse
 from compose.launch import in_process, virtual_processes
+from compose.recording import run
 from compose.recording.run import of_frames
 from compose.scenario.kills import KILL_POINTS
 from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.hunt import coverage, examination, invariants
+from compose.sweep.hunt import coverage, examination
 from compose.sweep.hunt.examination import MOST_TICKS, MOST_WITHOUT_END, examined, scenario_of, watched
 from compose.sweep.hunt.exploration import Hunt
 from compose.sweep.hunt.mutation import fault_lines, simpler
 from compose.sweep.hunt.mutation import seeds as hunted
 from protocol.journal.journal_file import CorruptJournal, MemoryJournal, packed
 from protocol.messages import Observation
+from tests import mutants
 from tests.commands import TandemProcess, tandem
 from tests.test_safety_distance import NEAR
+from world import tick
 
 
 def ended_after(runs: int) -> Callable[[Hunt], bool]:
@@ -187,9 +190,7 @@ GUARDS = {"hypothesis", "definite covariance", "determined position"}
 """The conditions that no mission was found to reach. tests/test_claim.py has them."""
 
 
-def test_a_mission_that_lasts_long_and_need_not_localise_is_examined_up_to_a_tick(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_mission_that_lasts_long_and_need_not_localise_is_examined_up_to_a_tick() -> None:
     table = scenario_table("random")
     table["robot"][1]["anchor"] = [100.0, 0.0]
     partition = {**table, "fault": [{"partition": True}]}
@@ -197,9 +198,18 @@ def test_a_mission_that_lasts_long_and_need_not_localise_is_examined_up_to_a_tic
     result = examined(partition)
     assert (result.breaches, result.refused, result.known.ticks) == ((), None, MOST_WITHOUT_END)
     assert "orbiting/2/open: contact" in result.reached
-    monkeypatch.setattr(invariants, "TRUTH_M", 0.0)
-    assert [one.kind for one in examined(partition).breaches] == ["truth lost"]
     assert 0 < examined(table).known.ticks < MOST_WITHOUT_END
+
+
+def test_a_claim_that_the_world_keeps_after_it_is_withdrawn_is_found(monkeypatch: pytest.MonkeyPatch) -> None:
+    table = cell("group-attacks-noise", 1) | {"seed": 8}
+    result = examined(table)
+    assert (result.breaches, result.refused) == ((), None)
+    assert "localised/3/open -> aligning/2/open" in result.reached
+    for module in (tick, run):
+        monkeypatch.setattr(module, "verdicts_after", tick.verdicts_after)  # it is the one of before again
+    mutants.kept()
+    assert [one.kind for one in examined(table).breaches] == ["withdrawn claim"]
 
 
 @pytest.mark.long
@@ -215,8 +225,9 @@ def test_every_task_condition_and_kind_of_message_is_reached_in_some_mission(
         scenario, _, _ = scenario_of(table)
         if scenario.max_ticks * len(scenario.robots) <= MOST_TICKS:
             sinks, messages, _ = watched(scenario, seen)
-            run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
-            seen |= coverage.reached(run)[0]
+            seen |= coverage.reached(
+                of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
+            )[0]
             left = coverage.never(seen)
         if not (left["tasks"] or left["messages"] or {*left["conditions"]} - GUARDS):
             break

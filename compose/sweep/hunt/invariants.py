@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from agent.estimation.claim import is_definite
-from compose.audit import agent_rules, rules
+from compose.audit import agent_rules, journal_rules, rules
 from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run
 from compose.sweep.trial import Trial, row
@@ -38,9 +38,10 @@ def breaches(run: Run, *, replayed: bool) -> Iterator[Breach]:
     """Yield the invariants that do not hold in `run`, the rules of the audit included.
 
     `replayed` is whether a second run of the same input has given the same bytes, which is what the rule
-    `decision` shows.
+    `decision` shows. The journals of a run that is cut break off, which the rule `order` reports.
     """
-    left = [one for one in rules.AUDIT_RULES if not (replayed and one is agent_rules.decision)]
+    shown = (agent_rules.decision,) * replayed + (journal_rules.order,) * (run.end is None)
+    left = [one for one in rules.AUDIT_RULES if one not in shown]
     for one in rules.audit_run(run, left).violations:
         if one.rule != "claim" or _must_be_right(run.scenario):
             yield Breach(f"audit: {one.rule}", one.line)
