@@ -128,6 +128,23 @@ def test_a_robot_with_three_ranges_keeps_no_other_one_from_its_claim() -> None:
     assert run.end.tick < 30
 
 
+@pytest.mark.parametrize(("seed", "ticks"), [(1, 4), (104124, 9)])
+def test_two_exact_robots_claim_by_five_ranges_or_drive_to_where_more_tell_enough(
+    seed: int, ticks: int
+) -> None:
+    """The second two begin where five ranges leave more than rounding: they took 427 ticks."""
+    area = 'accuracy = 0.2\nframe = "relative"\narea = [0.0, 0.0, 10.0, 10.0]'
+    exact = MISSION.replace("0.05", "0.0").replace("accuracy = 0.1", area)
+    run = run_mission(
+        parse(f'name = "met"\nseed = {seed}\n{exact}[[robot]]\nid = "r0"\n[[robot]]\nid = "r1"', "met")
+    )
+    assert outcome(run) == "localised"
+    assert run.length - 1 == ticks
+    claim = run.claim("r1")
+    assert claim is not None
+    assert claim.position_error < 1e-9
+
+
 def test_an_anchor_off_its_survey_is_named_before_its_ranges_pass_as_strays() -> None:
     room = MISSION.replace("5.0", "8.0") + "[team]\nrobots = 2\nanchors = 5\nside = 10.0"
     table = file_table(parse(f'name = "off"\nseed = 104\n{room}', "off"))

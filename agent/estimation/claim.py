@@ -98,7 +98,8 @@ def ranges(judged: Judged) -> str:
     """There are enough ranges from different places.
 
     They are {FEWEST_FOR_CLAIM} for a pair, {MUTUAL_RANGES} for others, and
-    {MUTUAL_RANGES_WITH_OUTLIERS} with outliers; for a finder that was lost, a few new ones.
+    {MUTUAL_RANGES_WITH_OUTLIERS} with outliers; {EXACT_RANGES} for an exact team without anchors; for a
+    finder that was lost, a few new ones.
     """
     if judged.ranges >= judged.required:
         return ""

@@ -53,6 +53,13 @@ Set on the sweep `noise`, in which 1 of 30 000 missions was wrong. With sigmas o
 would need 11. With fewer ranges, claims are too often wrong; with more, each mission takes longer.
 """
 
+EXACT_RANGES = 5
+"""The number of ranges from different places with which a robot of an exact team without anchors claims.
+
+Three leave a few poses, with a false one of which two more agree to 1e-6 m only by chance. With 8, two robots
+take 7 instead of 4 ticks in the median; with 4, no fewer.
+"""
+
 ENOUGH_FOR_HEADING = 20
 """The number of mutual ranges from different places after which HEADING_ACCURACY suffices for a claim.
 
@@ -205,6 +212,7 @@ def of_joint(
     fit = found.hypotheses[0].fit
     if user == "recording":
         fit = with_told_priors(fit)
+    exact = measured.only_rounding and bool(measured.started)
     return Judged(
         user=user,
         robot=robot,
@@ -212,7 +220,7 @@ def of_joint(
         measured=measured,
         hypotheses=certainty.poses,
         ranges=decisive_ranges(robot, measured),
-        required=sufficient_mutual_ranges(measured.noise),
+        required=EXACT_RANGES if exact else sufficient_mutual_ranges(measured.noise),
         stated=PlanningHypothesis(certainty.probability, fit.poses.ravel(), fit.covariance),
         inconsistency=misfit(fit),
         accuracy=accuracy,

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.following import Following
+from agent.estimation.following import EXACT_ACCURACY, Following
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
@@ -286,6 +286,8 @@ def _surveying(state: TeamState) -> TeamState | None:
     if state.doing == "surveying" and state.tick < state.planned + stride(mission):
         return state
     sigma = max(mission.noise.anchor_sigma, mission.noise.mutual_sigma)
+    if state.team.origin is not None and mission.noise.exact:  # a claim needs more than its accuracy
+        mission = replace(mission, accuracy=EXACT_ACCURACY)
     controls = plan_among(seen, sigma, mission, _frame_sigma(state))
     return replace(state, planned=state.tick).doing_next("surveying", 3, controls)
 
