@@ -1,8 +1,8 @@
-"""Teams without anchors in numbers: `uv run python -m tests.relative_teams [TEAMS]` prints two tables.
+"""Teams without anchors: `uv run python -m tests.relative_teams [TEAMS]` prints the table of docs/results.md.
 
 TEAMS (100 by default) of 2, 3 and 4 robots start at random in a square of 10 m, connected by ranges of at
-most 5 m, and a fifth as many of 8. The first table has their claims, beside the Cramér-Rao bound for the same
-measurements. The second one has their ticks, paired with those of the same robots that drive at random.
+most 5 m; a fifth as many of 8, and a tenth of 16. Their ticks are paired with those of the same robots that
+drive at random, and their claims are beside the Cramér-Rao bound for the same measurements.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 import random
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from functools import partial
 from statistics import fmean, median, stdev
@@ -29,10 +30,12 @@ from compose.recording.run import Run
 from compose.scenario.scenario_file import parse
 from protocol.messages import Localised, Undecided
 from protocol.motion import REST, Controls
+from protocol.noise import UNTOLD
 from tests.plans import table
 
-SIZES = (2, 3, 4, 8)
-SIGMAS = (0.0, 0.05)
+SIZES = {2: 1, 3: 1, 4: 1, 8: 5, 16: 10}
+"""The numbers of robots, and how many teams of 2 there are for one of them."""
+SIGMA = 0.05
 MOST_TICKS = 400
 """The ticks of a mission, and those that count for one that has not ended."""
 
@@ -49,6 +52,20 @@ class Result(NamedTuple):
     nees: list[float]
     bounds: list[float]
     """The Cramér-Rao bounds of the positions in m; without sigma, none."""
+
+
+def drawn_errors(seed: int) -> str:
+    """Return the tables of a world whose errors are drawn from the priors of those that nobody has told."""
+    draw = random.Random(f"errors/{seed}").gauss
+    return f"""
+        [world.noise]
+        mutual_bias = {draw(0.0, UNTOLD.range_bias)}
+        mutual_scale = {draw(0.0, UNTOLD.range_scale)}
+        radio_bias_sigma = {UNTOLD.pair_bias / math.sqrt(2.0)}
+        [world.noise.odometry]
+        scale_sigma = {UNTOLD.wheel_scale}
+        gyro_bias_sigma = {UNTOLD.gyro_bias}
+        """
 
 
 def scenario_of(robots: int, sigma: float, seed: int) -> str:
@@ -83,8 +100,8 @@ def at_random(seed: int, state: TeamState) -> TeamState:
     return state.doing_next("circling", 1, Controls(draw(0.0, mission.max_speed), turn))
 
 
-def result_of(robots: int, sigma: float, seed: int, task: Task) -> Result:
-    """Return the result of a mission whose robots choose what to do by `task`."""
+def result_of(robots: int, sigma: float, seed: int, task: Task, errors: str = "") -> Result:
+    """Return the result of a mission whose robots choose what to do by `task`, in a world with `errors`."""
     measured = dict[str, JointMeasurements]()
 
     def chosen(state: TeamState) -> TeamState:
@@ -93,7 +110,7 @@ def result_of(robots: int, sigma: float, seed: int, task: Task) -> Result:
         return task(state)
 
     with mock.patch("agent.planning.team.next_task", chosen):
-        run = run_mission(parse(scenario_of(robots, sigma, seed), "relative"))
+        run = run_mission(parse(scenario_of(robots, sigma, seed) + errors, "relative"))
     assert run.end is not None
     others = run.robots[1:]
     claims = [claim for robot in others if (claim := run.claim(robot)) is not None]
@@ -122,61 +139,48 @@ def rms(values: Sequence[float]) -> float:
     return math.sqrt(fmean([one * one for one in values]))
 
 
-def row_of_claims(robots: int, sigma: float, found: Sequence[Result]) -> list[str]:
-    """Return the row of the first table."""
-    errors = [each for one in found for each in one.errors]
-    nees = [each for one in found for each in one.nees]
-    bounds = [each for one in found for each in one.bounds]
-    ticks = [one.ticks for one in found if one.outcome == "localised"]
-    return [
-        *(str(robots), f"{sigma:g}", str(len(found))),
-        *[str(sum(one.outcome == name for one in found)) for name in ("localised", "wrong")],
-        f"{median(ticks):.0f} / {max(ticks)}" if ticks else "",
-        f"{rms(errors):.2g} / {max(errors):.2g}" if errors else "",
-        f"{fmean(nees):.2f}" if nees else "",
-        f"{rms(errors) / rms(bounds):.2f}" if bounds else "",
-    ]
-
-
-def row_of_ticks(robots: int, sigma: float, pairs: Sequence[tuple[Result, Result]]) -> list[str]:
-    """Return the row of the second table: planned and random motion."""
+def cell_of_ticks(planned: Sequence[Result], drawn: Sequence[Result]) -> str:
+    """Return the median ticks, and the mean ratio to those at random with its 95 % interval."""
     counted = [
-        [one.ticks if one.outcome == "localised" else MOST_TICKS for one in each]
-        for each in zip(*pairs, strict=True)
+        [one.ticks if one.outcome == "localised" else MOST_TICKS for one in each] for each in (planned, drawn)
     ]
-    logs = [math.log(planned / drawn) for planned, drawn in zip(*counted, strict=True)]
+    logs = [math.log(one / other) for one, other in zip(*counted, strict=True)]
     spread = 1.96 * stdev(logs) / math.sqrt(len(logs))
     low, ratio, high = [math.exp(fmean(logs) + side * spread) for side in (-1, 0, 1)]
-    ended = [sum(one.outcome == "localised" for one in each) for each in zip(*pairs, strict=True)]
-    return [
-        *(str(robots), f"{sigma:g}", str(len(pairs)), *map(str, ended)),
-        *[f"{median(each):.0f} / {fmean(each):.1f}" for each in counted],
-        f"{fmean(counted[0]) / fmean(counted[1]):.2f}",
-        f"{ratio:.2f} ({low:.2f} to {high:.2f})",
-    ]
+    return f"{median(counted[0]):g}, {ratio:.2f} ({low:.2f} to {high:.2f})"
+
+
+def nees_of(found: Sequence[Result]) -> str:
+    """Return the mean NEES of the claims."""
+    return f"{fmean([each for one in found for each in one.nees]):.2f}"
 
 
 def main(teams: int) -> None:
-    """Print both tables."""
-    claims, ticks = [], []
-    for robots in SIZES:
-        for sigma in SIGMAS:
-            seeds = range(1, 1 + max(teams if robots < 8 else teams // 5, 2))
-            planned = [result_of(robots, sigma, seed, team_tasks.next_task) for seed in seeds]
-            drawn = [result_of(robots, sigma, seed, partial(at_random, seed)) for seed in seeds]
-            claims.append(row_of_claims(robots, sigma, planned))
-            ticks.append(row_of_ticks(robots, sigma, list(zip(planned, drawn, strict=True))))
-            print(claims[-1], ticks[-1], file=sys.stderr, flush=True)
+    """Print the table, and how the missions have ended."""
+    rows, ended = [], Counter[str]()
+    for robots, share in SIZES.items():
+        seeds = range(1, 1 + max(teams // share, 2))
+        planned, drawn = (
+            [[result_of(robots, sigma, seed, task(seed)) for seed in seeds] for sigma in (0.0, SIGMA)]
+            for task in (lambda _: team_tasks.next_task, lambda seed: partial(at_random, seed))
+        )
+        noisy = planned[1]
+        off = [result_of(robots, SIGMA, seed, team_tasks.next_task, drawn_errors(seed)) for seed in seeds]
+        error = rms([each for one in noisy for each in one.errors])
+        row = [
+            *(f"{robots} ({len(seeds)})", *map(cell_of_ticks, planned, drawn), f"{error:.2g} m"),
+            f"{error / rms([each for one in noisy for each in one.bounds]):.2f}",
+            *(nees_of(noisy), nees_of(off)),
+        ]
+        rows.append(row)
+        ended.update([one.outcome for each in (*planned, off) for one in each])
+        print(row, dict(ended), file=sys.stderr, flush=True)
     head = [
-        *("robots", "sigma, m", "missions", "localised", "wrong", "ticks, median / most"),
-        *("error in m, RMS / largest", "NEES (3)", "RMS error over Cramér-Rao"),
+        *("robots (missions)", "exact: median ticks, ratio (95 %)", f"{SIGMA} m: median ticks, ratio (95 %)"),
+        *("RMS error", "over Cramér-Rao", "NEES (3)", "NEES, errors drawn"),
     ]
-    print(table(head, claims), end="\n\n")
-    head = [
-        *("robots", "sigma, m", "pairs", "localised", "at random", "ticks, median / mean", "at random"),
-        *("ratio of means", "mean ratio (95 %)"),
-    ]
-    print(table(head, ticks))
+    print(table(head, rows), end="\n\n")
+    print("Planned motion:", ", ".join([f"{count} {name}" for name, count in ended.items()]))
 
 
 if __name__ == "__main__":
