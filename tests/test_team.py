@@ -28,6 +28,7 @@ from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
 from agent.planning.team import TeamPlanner
 from agent.planning.team_state import TeamState
+from agent.planning.team_tasks import next_task
 from compose.audit.claim_rules import bound, distance
 from compose.audit.rules import audit_run, replayed
 from compose.errors import BadScenario
@@ -492,6 +493,17 @@ def state_after(ticks: int) -> tuple[TeamState, Observation]:
 
 
 REACHED = state_after(3)
+
+
+def test_a_robot_without_a_result_returns_to_one_that_has_one_if_it_is_alone() -> None:
+    """Robots that have one wait where both were nearest, and did so for three loops."""
+    state = replace(REACHED[0], apart={}, verdict=None)
+    done = replace(state.log, done=frozenset({1, 2}))
+    assert next_task(replace(state, log=done)).doing == "homing"
+    near = replace(state, log=done, apart=REACHED[0].apart)
+    assert next_task(near).doing != "homing"
+
+
 COUNTS = st.integers(0, 6) | st.sampled_from([2**31, 2**53])
 ANY_RANGING = st.builds(Ranging, COUNTS, st.floats(0.0, 1e7) | st.floats(0.0, 10.0))
 ANY_ENTRY = st.builds(

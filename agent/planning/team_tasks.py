@@ -175,8 +175,12 @@ def _alone(state: TeamState) -> bool:
 
 
 def _joining(state: TeamState) -> TeamState | None:
-    """Return `state`, in a team without anchors, on its way to a robot that has no result."""
-    lost = [state.nearest[one].place for one in state.waiting if state.nearest[one].range < math.inf]
+    """Return `state`, in a team without anchors, on its way to a robot that has no result.
+
+    Without one itself, it goes to any other one, which returns to where both were nearest, too.
+    """
+    others = state.waiting if state.verdict else [*state.waiting, *sorted(state.log.done)]
+    lost = [state.nearest[one].place for one in others if state.nearest[one].range < math.inf]
     if state.team.origin is None or not lost or state.waiting_here or (not state.verdict and state.apart):
         return None
     return _homing(state, lost[0])
