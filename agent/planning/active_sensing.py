@@ -7,7 +7,6 @@ variance of the positions.
 
 from __future__ import annotations
 
-import ctypes
 import math
 from collections.abc import Sequence
 from functools import lru_cache
@@ -219,7 +218,7 @@ def _keep_apart(
 
 def _weighed(
     mission: Mission, sigma: float, own: float, farthest: float, outside: float, standing: float
-) -> ctypes.Array[ctypes.c_char]:
+) -> Any:
     """Return `Weighed` of hypotheses.c; `own` is as there."""
     reach = mission.sensing_range
     of_confusion = (FARTHEST_PREDICTION * reach, SIGMA_FACTOR * sigma, LARGEST_GAP, CONFUSION_COST)
