@@ -116,15 +116,14 @@ def _result(
     }
     posed = [one for one in measured.robots if not without[one.id]]
     unseen = {one.id: one.unseen.sigmas(np.array([t]))[0] for one in posed}
-    best = found.hypotheses[0].fit if found.hypotheses else None
-    far = {name: far_between(best, place[name], one, accuracy) for name, one in unseen.items() if best}
+    fits = [with_told_priors(each.fit) for each in found.hypotheses]
+    far = {name: far_between(fits[0], place[name], one, accuracy) for name, one in unseen.items()}
     reasons = {name: reason or far.get(name, "") for name, reason in reasons.items()}
     without = {name: why for name, why in without.items() if why}
     reason = [f"{one.id}: {reasons[one.id]}" for one in posed if reasons.get(one.id)]
     reason += [f"{name} is undetermined: {why}" for name, why in without.items()]
     more = f"; and {len(reason) - 1} more" if len(reason) > 1 else ""
     claims = {one.id: reasons.get(one.id) == "" for one in measured.robots}
-    fits = [with_told_priors(each.fit) for each in found.hypotheses]
     centres = [
         {one.id: _centre(one.recorded, place[one.id], fit, used.origin, unseen[one.id]) for one in posed}
         for fit in fits
