@@ -9,6 +9,9 @@
 
 typedef long long Index;
 
+/* What a function returns that got no memory. */
+enum { NO_MEMORY = -2 };
+
 /* A function that is compiled for each number of unknowns. */
 #define SIZED static inline __attribute__((always_inline))
 
@@ -212,7 +215,7 @@ Index anchor_guesses(Index count, const double *x, const double *y, const double
     const Circles of = {count, x, y, rho, sigma};
     const Index all = crossings(&of, couples, first, second, known, points);
     double *work = malloc(sizeof(double) * (8 * count + 3 * all)), *likely = work + 8 * count, best = -INFINITY;
-    if (!work) return -2;
+    if (!work) return NO_MEMORY;
     double *kept = likely + all;
     Spread spread = {count, by, work + 5 * count, work + 6 * count, work + 7 * count};
     for (Index step = 0; step < steps; step++) {
@@ -447,7 +450,7 @@ Index placements(Index count, Index middle, const double *near_x, const double *
     double *work = malloc(sizeof(double) * count * (UNKNOWNS + 4)), *logs = work + count * (UNKNOWNS + 1);
     Index (*cells)[4] = malloc(sizeof *cells * crowd);
     Spread spread = {count, by, logs, logs + count, logs + 2 * count};
-    if (!all || !work || !cells) circles = 0, steps = -2;
+    if (!all || !work || !cells) circles = 0, steps = NO_MEMORY;
     for (Index k = 0; k < circles; k++) end = scanned(&of, circle + k, end);
     Index left = end - all;
     for (Index step = 0; step < steps; step++) {
@@ -563,7 +566,7 @@ int detections(const Detection *by, Index count, const Index *terms, const Index
     Index most = 0;
     for (Index t = 0; t < count; t++) most = terms[4 * t + 3] > most ? terms[4 * t + 3] : most;
     double *memory = malloc(sizeof *memory * (most + 6 * robots)), between = 0.0;
-    if (!memory) return -2;
+    if (!memory) return NO_MEMORY;
     *total = 0.0;
     for (Index t = 0; t < count; t++, ticks += terms[3], terms += 4) {
         between += seen(by, terms[0], terms[1], (double)terms[2], terms[3], ticks, robots, points, paths, poses, pivot,

@@ -49,6 +49,9 @@ static const double SHORTER_STEPS[] = {1.0, 0.5, 0.25, 0.0625};
 
 typedef long long Index;
 
+/* What a function returns that got no memory. */
+enum { NO_MEMORY = -2 };
+
 /* A function that is compiled for each of the sizes of BY_SIZE. */
 #define SIZED static inline __attribute__((always_inline))
 
@@ -1224,7 +1227,7 @@ int gauss_newton_step(const Measured *of, double *walk, const double *poses, con
     placed((double **)&from, walk, sizes + 6, 5);
     placed((double **)&to, memory, sizes + 2 * POINT, STEP);
     double *space = workspace(of, &w);
-    if (!space) return -2;
+    if (!space) return NO_MEMORY;
     const int found = stepping(of, &from, poses, variance, ridge, largest, &w, &to);
     free(space);
     return found;
@@ -1240,7 +1243,7 @@ int fitted(const Measured *of, const Weighing *by, const Convergence *until, int
     sizes_of(of, sizes);
     placed((double **)&to, memory, sizes, ARRAYS);
     double *space = workspace(of, &w);
-    if (!space) return -2;
+    if (!space) return NO_MEMORY;
     const int found = until->shortest < 0.0 ? holding(of, by, until->steps, &w, &to)
                                             : converged(of, by, until, weighed, &w, &to);
     free(space);

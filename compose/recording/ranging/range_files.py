@@ -146,7 +146,7 @@ def rows_in(path: Path, kind: type[RowKind]) -> Iterator[tuple[RowKind, SourcePl
     """Yield the rows of the CSV file `path` and their places. Raises like `_tables`."""
     lines = csv.reader(io.StringIO(_text(path), newline=""), strict=True)
     try:
-        head = next(lines, [])
+        head = [name.strip() for name in next(lines, [])]
         _check_head(head, kind, SourcePlace(path, 1))
         for values in lines:
             place = SourcePlace(path, lines.line_num)
@@ -162,7 +162,6 @@ def rows_in(path: Path, kind: type[RowKind]) -> Iterator[tuple[RowKind, SourcePl
 
 def _check_head(head: list[str], kind: type[Row], place: SourcePlace) -> None:
     """Raise BadRecording unless `head` has the columns of `kind`, each once, and all that are required."""
-    head[:] = [name.strip() for name in head]
     known = kind.__struct_encode_fields__
     required = known[: len(known) - len(kind.__struct_defaults__)]
     unknown = [name for name in head if name not in known]
