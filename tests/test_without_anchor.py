@@ -97,10 +97,11 @@ def driven(places: tuple[tuple[float, float], ...], start: Pose, mission: Missio
     path, config = [start], replace(load("paper-1").config("a"), mission=mission)
     task: Sweeping | Looping = Sweeping(places)
     while True:
-        task = sweep.onward(task, path[-1], mission, 1e-9)
+        state = RobotState(config, odometry=path[-1])
+        task = sweep.onward(state, task)
         if not task.places:
             return path
-        driven = drive.controls(RobotState(config, task=task, odometry=path[-1]))
+        driven = drive.controls(state.doing(task))
         path.append(step(path[-1], driven.v, driven.omega, mission.period))
 
 

@@ -181,10 +181,10 @@ def _moved_on(state: RobotState, found: Contacted) -> RobotState:
     if finder.covariance.position_sigma > mission.accuracy:
         return state.doing(Standing())
     if isinstance(state.task, Looping):
-        moved = sweep.onward(state.task, state.odometry, mission, state.estimator.pose_tolerance)
+        moved = sweep.onward(state, state.task)
         if moved.places and isinstance(moved, Looping):
             return state.doing(moved)
     if finder.latest <= state.tick - contact_ticks(mission) // 2:
         return state.doing(Standing())
     side = OWN_SIDE * mission.sensing_range
-    return state.doing(sweep.looping_both_ways(state.odometry, side, side, state.tick))
+    return state.doing(sweep.looping_both_ways(state, side, side, state.tick))

@@ -52,10 +52,9 @@ def controls(state: RobotState) -> Controls:
         ):
             return task.command
         case tasks.Homing(place) | tasks.Travelling(place):
-            back = isinstance(task, tasks.Homing)
-            return towards(place, odometry, mission, state.estimator.pose_tolerance, backward=back) or REST
+            return way_to(state, place, backward=isinstance(task, tasks.Homing)) or REST
         case tasks.Sweeping((place, *_)) | tasks.Looping((place, *_)):
-            way = towards(place, odometry, mission, state.estimator.pose_tolerance) or REST
+            way = way_to(state, place) or REST
             return Controls(min(way.v, sweep_speed(mission)), way.omega)
         case _:
             return REST
@@ -85,6 +84,12 @@ def left_to_orbit(state: RobotState) -> float:
     """Return the distance in m from the robot outward to its orbit; negative outside the orbit."""
     local = state.local_pose
     return state.config.orbit.radius - math.hypot(local.x, local.y)
+
+
+def way_to(state: RobotState, place: Place, *, backward: bool = False) -> Controls | None:
+    """Return the controls from where the robot is to `place` (see `towards`); None if it is there."""
+    tolerance = state.estimator.pose_tolerance
+    return towards(place, state.odometry, state.config.mission, tolerance, backward=backward)
 
 
 def towards(

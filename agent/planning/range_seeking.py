@@ -53,12 +53,11 @@ LOST_AFTER = 3
 
 def homeward(state: RobotState, task: Homing) -> RobotState:
     """Return `state` after a tick of `task` without a range: at the place, on a spiral or as at the start."""
-    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
-    if drive.towards(task.place, state.odometry, mission, tolerance) is not None:
+    if drive.way_to(state, task.place) is not None:
         return state
     if task.side is None:
         return state.doing(Straight("anchor", state.odometry, 0.0))
-    return state.doing(Homing(next_on_spiral(task.place, task.side, mission), task.side + 1))
+    return state.doing(Homing(next_on_spiral(task.place, task.side, state.config.mission), task.side + 1))
 
 
 def is_lost(state: RobotState, strides: int = LOST_AFTER) -> bool:

@@ -124,7 +124,7 @@ def _resected(state: RobotState, found: Resected) -> tuple[RobotState, Resected]
         if not isinstance(state.task, Looping):
             positions = resection.positions(standing, LARGEST_MISFIT)
             if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
-                return state.doing(sweep.looping(state.odometry, state.config.mission, state.tick)), found
+                return state.doing(sweep.looping(state, state.tick)), found
         elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
             found = replace(found, possible=possible)
             if resection.is_certain(standing, moved, possible):
@@ -161,12 +161,11 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     """
     if not isinstance(state.task, Looping):
         return state.doing(Standing() if found.places or found.candidates else Awaiting())
-    mission, since, tolerance = state.config.mission, state.task.since, state.estimator.pose_tolerance
-    task = sweep.onward(state.task, state.odometry, mission, tolerance)
+    task = sweep.onward(state, state.task)
     if task.places:
         return state.doing(task)
     latest = max([tick for robot, tick in found.places if robot not in found.candidates], default=-KEPT)
-    if latest > state.tick - KEPT and since > state.tick - LOOPS_FOR:
-        return state.doing(sweep.looping(state.odometry, mission, since))
+    if latest > state.tick - KEPT and state.task.since > state.tick - LOOPS_FOR:
+        return state.doing(sweep.looping(state, state.task.since))
     found = Resected(state.odometry, state.tick, candidates=found.candidates)
     return state.doing(Standing() if found.candidates else Awaiting()).with_agenda(found=found)

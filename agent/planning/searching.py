@@ -136,18 +136,18 @@ def swept(state: RobotState) -> RobotState:
     With exact sensors, it stops for all that are near. With noisy ones, it stops where its own pose is known
     well enough; its verdict is Undecided if that contradicts its claim.
     """
-    mission, odometry, helped = state.config.mission, state.odometry, _helped(state)
+    mission, helped = state.config.mission, _helped(state)
     if sweep.reports_covariance(state):
         state = _with_contact(own_pose.updated(state), helped)
         if state.verdict is not None:
             return state
         helped = [one for one in helped if _ticks_since(state, one) <= LINGER]
         sides = ALONG * mission.sensing_range, ASIDE * mission.sensing_range
-        loop = partial(sweep.looping_both_ways, odometry, *sides)
+        loop = partial(sweep.looping_both_ways, state, *sides)
         stops, longest = any(_stops_for(state, one) for one in helped), contact_ticks(mission)
     else:
         helped = [one for one in helped if _is_near(state, one)]
-        loop, stops, longest = partial(sweep.looping, odometry, mission), bool(helped), LOOPS_FOR
+        loop, stops, longest = partial(sweep.looping, state), bool(helped), LOOPS_FOR
     state = sweep.moved_on(state, helped, loop, stops=stops, longest=longest)
     return _with_reference(state, None) if sweep.is_over(state) else state
 

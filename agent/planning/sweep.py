@@ -7,17 +7,16 @@ from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 
-from agent.planning.drive import towards
+from agent.planning.drive import way_to
 from agent.planning.state import RobotState
 from agent.planning.tasks import Looping, Sweeping, transformed
-from protocol.mission import Mission
-from protocol.motion import Pose, inverse
+from protocol.motion import inverse
 from protocol.sweep_strips import SIDE, Place
 
 
-def looping(odometry: Pose, mission: Mission, since: int, then: tuple[Place, ...] = ()) -> Looping:
-    """Return a square that begins ahead of `odometry` and goes to the left, with these `since` and `then`."""
-    side = SIDE * mission.sensing_range
+def looping(state: RobotState, since: int, then: tuple[Place, ...] = ()) -> Looping:
+    """Return a square that begins ahead of the robot and goes to the left, with these `since` and `then`."""
+    side, odometry = SIDE * state.config.mission.sensing_range, state.odometry
     x, y = side * math.cos(odometry.heading), side * math.sin(odometry.heading)
     corners = [(0.0, 0.0), (x, y), (x - y, y + x), (-y, x)]
     places = [(odometry.x + dx, odometry.y + dy) for dx, dy in corners]
@@ -25,9 +24,9 @@ def looping(odometry: Pose, mission: Mission, since: int, then: tuple[Place, ...
 
 
 def looping_both_ways(
-    odometry: Pose, along: float, aside: float, since: int, then: tuple[Place, ...] = ()
+    state: RobotState, along: float, aside: float, since: int, then: tuple[Place, ...] = ()
 ) -> Looping:
-    """Return a rectangle behind `odometry`, to its left, and then the same to its right.
+    """Return a rectangle behind the robot, to its left, and then the same to its right.
 
     Its sides are `along` and `aside`, in m. In both together, the robot turns as much to the left as to the
     right, so an error of the scale of its gyro does not add up.
@@ -37,14 +36,12 @@ def looping_both_ways(
         for side in (1.0, -1.0)
         for x, y in ((0.0, 1.0), (-along, 1.0), (-along, 0.0), (0.0, 0.0))
     ]
-    return Looping(transformed(odometry, corners), then, since)
+    return Looping(transformed(state.odometry, corners), then, since)
 
 
-def onward(
-    task: Sweeping | Looping, odometry: Pose, mission: Mission, tolerance: float
-) -> Sweeping | Looping:
+def onward(state: RobotState, task: Sweeping | Looping) -> Sweeping | Looping:
     """Return `task` without the places at which the robot has arrived."""
-    while task.places and towards(task.places[0], odometry, mission, tolerance) is None:
+    while task.places and way_to(state, task.places[0]) is None:
         task = replace(task, places=task.places[1:])
     return task
 
@@ -134,9 +131,8 @@ def moved_on(
     places that are left of the sweep. It repeats the loop until nobody is in contact any more, or for
     `longest` ticks, and then returns to where it has left its strip.
     """
-    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
     assert isinstance(state.task, Sweeping | Looping)
-    task = onward(state.task, state.odometry, mission, tolerance)
+    task = onward(state, state.task)
     if isinstance(task, Looping) and state.tick - task.since > longest:
         for robot in helped:
             state = state.with_other(robot, failed=True)
@@ -147,7 +143,7 @@ def moved_on(
         case Looping((), then, since) if helped:
             task = loop(since, then)
         case Looping(_, then) if not helped:
-            task = onward(Sweeping(then), state.odometry, mission, tolerance)
+            task = onward(state, Sweeping(then))
     return state.doing(task)
 
 

@@ -15,7 +15,7 @@ from msgspec.structs import replace
 
 from agent.planning import separation
 from agent.planning.agenda import Bypass
-from agent.planning.drive import towards
+from agent.planning.drive import way_to
 from agent.planning.state import RobotState
 from agent.planning.tasks import Travelling
 from protocol.messages import Contact
@@ -45,11 +45,10 @@ YIELDS = 60
 def searching(state: RobotState) -> RobotState:
     """Return `state` of a visitor out of range; if it has arrived, on the next leg of its search."""
     assert isinstance(state.task, Travelling)
-    mission, tolerance = state.config.mission, state.estimator.pose_tolerance
-    if towards(state.task.place, state.odometry, mission, tolerance) is not None:
+    if way_to(state, state.task.place) is not None:
         return state
     begin, anchor = state.agenda.framed_at, _peer_anchor(state)
-    leg = next_leg(state.task, (begin.x, begin.y), (anchor.x, anchor.y), mission)
+    leg = next_leg(state.task, (begin.x, begin.y), (anchor.x, anchor.y), state.config.mission)
     return state.doing(leg)
 
 
@@ -120,8 +119,8 @@ def passing_others(state: RobotState, contacts: Sequence[Contact]) -> RobotState
         return state.with_agenda(passing=replace(passing, leeway=0.0, blocked=0, yielded=yielded))
     now = passed(passing, task, state.odometry, free, mission)
     if isinstance(task, Travelling) and (now.places or passing.places):
-        places, tolerance = now.places, state.estimator.pose_tolerance
-        if places and towards(places[0], state.odometry, mission, tolerance) is None:
+        places = now.places
+        if places and way_to(state, places[0]) is None:
             places = places[1:]
         now = replace(now, places=places)
         task = Travelling(places[0] if places else stop(state))
