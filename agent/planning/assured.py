@@ -7,26 +7,13 @@ as the mission asks, in the phases of the paper (`phase1_anchor`, `phase2_orbit`
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
-from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
-from agent.planning import (
-    active_sensing,
-    exchange,
-    phase1_anchor,
-    phase2_orbit,
-    phase3_encounter,
-    plausibility,
-    tasks,
-)
+from agent.planning import exchange, phase1_anchor, phase2_orbit, phase3_encounter, tasks
 from agent.planning.exchange import LogPlanner, Steps
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
-from agent.planning.strides import is_planning_tick
-from protocol.messages import Command, Report
-from protocol.mission import Mission
-from protocol.motion import REST, Controls
+from protocol.messages import Command
+from protocol.motion import REST
 
 
 class Assured(LogPlanner):
@@ -45,41 +32,9 @@ class Assured(LogPlanner):
     )
     ACTIVE_SENSING = True
 
-    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
-        """Return `state` with the peer's `reports` and with the task that follows from them."""
-        if reports:
-            state = plausibility.with_reports(state, reports)
-        if not state.in_contact or isinstance(state.task, tasks.Done):
-            return state
-        match state.task:
-            case tasks.Orbital() | tasks.Travelling():
-                return self._steps(state).phase3(state, self.joint_manoeuvres)
-            case tasks.Resting():
-                return phase3_encounter.decided(state, self.last_manoeuvre)
-            case tasks.Listening() | tasks.Surveying("peer") if is_planning_tick(state):
-                return phase3_encounter.surveyed(state, self.joint_manoeuvres)
-            case _:
-                return state
-
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
         return exchange.command(state, REST) if _must_wait(state) else super().command(state)
-
-    def joint_manoeuvres(
-        self,
-        hypotheses: Sequence[PlanningHypothesis],
-        m2: tuple[float, float],
-        rho: float,
-        mission: Mission,
-    ) -> tuple[Controls, Controls]:
-        """Return the manoeuvres of a and b in phase 3 with noisy sensors, for `stride` ticks.
-
-        `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
-        `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
-        robots compute both from the same measurements. It is not asked while they are stalled (see
-        `strides`), nor when one of them has claimed its pose.
-        """
-        return active_sensing.plan_together(tuple(hypotheses), m2, rho, mission)
 
 
 def _must_wait(state: RobotState) -> bool:

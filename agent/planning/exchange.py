@@ -8,15 +8,18 @@ from typing import Any, NamedTuple
 import msgspec
 from msgspec.structs import replace
 
+from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.estimation.judged import required_mutual_ranges
 from agent.estimation.solver import Solver
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import (
+    active_sensing,
     drive,
     phase1_anchor,
     phase3_encounter,
     phase3_last_manoeuvre,
+    plausibility,
     range_seeking,
     separation,
     tasks,
@@ -24,6 +27,7 @@ from agent.planning import (
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres, Planner, Summary
 from agent.planning.state import RobotState
+from agent.planning.strides import is_planning_tick
 from protocol.messages import (
     Command,
     Estimate,
@@ -152,10 +156,12 @@ class Steps(NamedTuple):
     """It continues phase 2 from a task; the last argument says whether there is a new range to the anchor."""
     phase3: Callable[[RobotState, Any], RobotState]
     """It begins phase 3 in contact with the peer, if that can begin. It may plan by `joint_manoeuvres`."""
+    turns: Callable[[RobotState, phase3_encounter.PlannedLast], RobotState] = phase3_encounter.decided
+    """It continues phase 3 of a robot that stands still in contact. It plans by `last_manoeuvre`."""
 
 
 class LogPlanner(Planner[RobotState, Report]):
-    """A planner with the state of the shipped planners. Subclasses define `decide`."""
+    """A planner with the state of the shipped planners, which differ in their steps."""
 
     BODY = Report
     MANOEUVRES: Manoeuvres
@@ -199,6 +205,22 @@ class LogPlanner(Planner[RobotState, Report]):
                 return phase1_anchor.sensed(state, task, ranged)
             case tasks.Surveying() | tasks.Listening() | tasks.Retreating():
                 return phase3_encounter.sensed(state, task)
+            case _:
+                return state
+
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        """Return `state` with the peer's `reports` and with the task that follows from them."""
+        if reports:
+            state = plausibility.with_reports(state, reports)
+        if not state.in_contact or isinstance(state.task, tasks.Done):
+            return state
+        match state.task:
+            case tasks.Orbital() | tasks.Travelling():
+                return self._steps(state).phase3(state, self.joint_manoeuvres)
+            case tasks.Resting():
+                return self._steps(state).turns(state, self.last_manoeuvre)
+            case tasks.Listening() | tasks.Surveying("peer") if is_planning_tick(state):
+                return phase3_encounter.surveyed(state, self.joint_manoeuvres)
             case _:
                 return state
 
@@ -264,6 +286,22 @@ class LogPlanner(Planner[RobotState, Report]):
         range.
         """
         return phase3_last_manoeuvre.last_manoeuvre(question, mission, self.MANOEUVRES)
+
+    def joint_manoeuvres(
+        self,
+        hypotheses: Sequence[PlanningHypothesis],
+        m2: tuple[float, float],
+        rho: float,
+        mission: Mission,
+    ) -> tuple[Controls, Controls]:
+        """Return the manoeuvres of a and b in phase 3 with noisy sensors, for `stride` ticks.
+
+        `hypotheses` are about the poses of both robots relative to M1, the most probable first. M2 is at
+        `m2` in m, and `rho` is the latest range between the robots in m. A subclass may plan others; both
+        robots compute both from the same measurements. It is not asked while they are stalled (see
+        `strides`), nor when one of them has claimed its pose.
+        """
+        return active_sensing.plan_together(tuple(hypotheses), m2, rho, mission)
 
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""

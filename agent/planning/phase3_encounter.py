@@ -22,12 +22,15 @@ from protocol.messages import Localised
 from protocol.mission import SHORTEST_STEP, Mission, Role
 from protocol.motion import Controls, Pose, compose, inverse
 
+PlannedLast = Callable[[Question, Mission], Plan | None]
+"""The type of `LogPlanner.last_manoeuvre`."""
+
 
 def met_on_orbits(state: RobotState, planned: object) -> RobotState:
     """Begin phase 3 once both robots are on their orbits, as published."""
     del planned
-    peer = state.peer_state
-    return begun(state) if peer.phase == 3 or peer.state == state.task.name else state
+    peer, orbiting = state.peer_state, isinstance(state.task, tasks.Orbiting)
+    return begun(state) if orbiting and (peer.phase == 3 or peer.state == state.task.name) else state
 
 
 def begun(state: RobotState) -> RobotState:
@@ -92,9 +95,7 @@ def pair_estimate(
     return state if estimate.verdict is None else state.ended(estimate.verdict), estimate
 
 
-def last_manoeuvre(
-    state: RobotState, estimate: PairEstimate, planned: Callable[[Question, Mission], Plan | None]
-) -> RobotState | None:
+def last_manoeuvre(state: RobotState, estimate: PairEstimate, planned: PlannedLast) -> RobotState | None:
     """Return `state` on its last manoeuvre; None if every manoeuvre violates the safety distance.
 
     `planned` returns the manoeuvre that tells several placements apart, or tests one for the first time.
@@ -108,6 +109,28 @@ def last_manoeuvre(
     if plan is None:
         return None
     return replace(state, task=tasks.LastManoeuvre(plan.command, state.odometry), plan=plan)
+
+
+def as_published(state: RobotState, planned: PlannedLast) -> RobotState:
+    """Evaluate phase 3 after a's second mutual range, and again after b's last manoeuvre.
+
+    The mutual ranges count from the encounter on. Return `state` with a verdict, with b's last
+    manoeuvre, or with the same task.
+    """
+    evaluated = with_new_ticks(state)
+    if evaluated is None:
+        return state
+    first_tick, moved = state.belief.encounter_tick, state.plan is not None
+    assert first_tick is not None
+    a_waits = not isinstance(state.task, tasks.Standing) or state.peer_state.state == tasks.Waiting.name
+    second = a_waits or moved
+    state, estimate = pair_estimate(evaluated, first_tick, second_range=second)
+    if estimate is None or state.verdict is not None or state.config.role == "a":
+        return state
+    if moved:
+        return state.undecided(estimate.failure)
+    moving = last_manoeuvre(state, estimate, planned)
+    return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")
 
 
 # --- the steps of `assured` ---------------------------------------------------------------------------
@@ -126,7 +149,7 @@ def met(state: RobotState, planned: object) -> RobotState:
     return begun(state) if peer.phase == 3 or (peer.start is not None and state.off_anchor) else state
 
 
-def decided(state: RobotState, planned: Callable[[Question, Mission], Plan | None]) -> RobotState:
+def decided(state: RobotState, planned: PlannedLast) -> RobotState:
     """Return `state` after the evaluation of both logs: with a verdict, a last manoeuvre, or as it was.
 
     All ticks count, including those before the encounter. The robots take turns until a redundant range
@@ -159,7 +182,7 @@ LOST_AFTER_IN_PHASE_3 = 6
 JointManoeuvres = Callable[
     [Sequence[PlanningHypothesis], tuple[float, float], float, Mission], tuple[Controls, Controls]
 ]
-"""The type of `Assured.joint_manoeuvres`."""
+"""The type of `LogPlanner.joint_manoeuvres`."""
 
 
 def sensed(state: RobotState, task: tasks.Surveying | tasks.Listening | tasks.Retreating) -> RobotState:
