@@ -18,8 +18,8 @@ from agent.estimation.gaussian.anchor_guesses import (
     SAME_POSITION,
     TWINS,
     UNLIKELY,
-    _couples,
     _odometry_variance,
+    couples,
 )
 from agent.estimation.gaussian.evidence import CLEAR, EDGE, SILENT
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, Silence
@@ -89,7 +89,7 @@ def _crossings(own: JointMeasurements) -> Array:
     path, ranges = own.paths[0], own.ranges
     if len(ranges.rho) < 2:
         return np.empty((0, 2))
-    i, j = _couples(len(ranges.rho))
+    i, j = couples(len(ranges.rho))
     x, y, rho = path.x[ranges.tick], path.y[ranges.tick], ranges.rho
     dx, dy = x[j] - x[i], y[j] - y[i]
     apart = hypot(dx, dy)

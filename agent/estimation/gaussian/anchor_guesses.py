@@ -58,13 +58,13 @@ def anchors(own: JointMeasurements, known: Sequence[Sequence[float]] = ()) -> Ar
     path, ranges, near = own.paths[0], own.ranges, SAME_POSITION * own.reach
     sigma = np.sqrt(np.square(ranges.sigma) + _odometry_variance(own) + own.loosened)
     circles = (path.x[ranges.tick], path.y[ranges.tick], ranges.rho, sigma, mixture(own.noise))
-    couples = _couples(len(sigma))
+    pairs = couples(len(sigma))
     finer = np.array([near * POSITION_FINER**step for step in range(POLISHINGS + 1)])
     same = near * POSITION_FINER + TWINS * float(np.min(sigma, initial=math.inf))
-    points = np.empty((len(known) + 2 * len(couples[0]), 2))
+    points = np.empty((len(known) + 2 * len(pairs[0]), 2))
     points[: len(known)] = np.array(known).reshape(-1, 2)
     found = library().anchor_guesses(
-        *(len(sigma), *map(address, circles), len(couples[0]), *map(address, couples), len(known)),
+        *(len(sigma), *map(address, circles), len(pairs[0]), *map(address, pairs), len(known)),
         *(POLISHINGS, address(finer), 0.5 * own.reach, UNLIKELY, same, MOST_GUESSES, address(points)),
     )
     return points[:found]
@@ -85,16 +85,16 @@ def _odometry_variance(own: JointMeasurements) -> Array:
 
 
 @cache
-def spread_out(count: int) -> Places:
-    """Return at most SEED_RANGES of the indices below `count`, evenly spaced."""
+def spread_out(count: int, most: int = SEED_RANGES) -> Places:
+    """Return at most `most` of the indices below `count`, evenly spaced."""
     # numpy.unique would import numpy.ma in the first search of a mission
-    spread = np.linspace(0, count - 1, SEED_RANGES).round().astype(np.intp)
+    spread = np.linspace(0, count - 1, most).round().astype(np.intp)
     return spread[np.diff(spread, prepend=-1) > 0]
 
 
 @cache
-def _couples(count: int) -> tuple[Places, Places]:
+def couples(count: int, most: int = SEED_RANGES) -> tuple[Places, Places]:
     """Return the first and the second of each two of the indices `spread_out`."""
-    chosen = spread_out(count)
+    chosen = spread_out(count, most)
     i, j = np.triu_indices(len(chosen), 1)
     return chosen[i], chosen[j]

@@ -12,6 +12,7 @@ import numpy as np
 
 from agent.estimation.elementary import cos, hypot, product, sin, solve
 from agent.estimation.fit import Start
+from agent.estimation.gaussian.anchor_guesses import couples
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.odometry_noise import Array, Places
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR, inlier_probability, log_likelihood
@@ -59,9 +60,7 @@ def beacon_guesses(robot: JointMeasurements) -> list[Array]:
     # where the robot would have started if it were at the beacon; shape (turns, N)
     dx, dy = rotated(c, s, px, py)
     x, y = place[:, 0] - dx, place[:, 1] - dy
-    chosen = np.linspace(0, len(px) - 1, min(CIRCLES, len(px))).round().astype(np.intp)
-    i, j = np.triu_indices(len(chosen), 1)
-    i, j = chosen[i], chosen[j]
+    i, j = couples(len(px), CIRCLES)
     dx, dy = x[:, j] - x[:, i], y[:, j] - y[:, i]
     apart = np.maximum(hypot(dx, dy), SIGMA_FLOOR)
     along = (apart**2 + ranges.rho[i] ** 2 - ranges.rho[j] ** 2) / (2.0 * apart)
