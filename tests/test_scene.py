@@ -210,7 +210,7 @@ def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Pat
 
     def begin(tick: int) -> None:
         for command in journals.known.ticks[tick].commands.values():
-            known.add(command, 0)
+            known.add(command)
 
     def present(**there: bool) -> None:
         for robot, one in there.items():
@@ -231,7 +231,7 @@ def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Pat
     begin(3)
     present(b=False)
     present(b=True)
-    known.add(journals.known.final_reports["a"], 0)
+    known.add(journals.known.final_reports["a"])
     present(a=False)  # its part of the mission has ended
     shown = scenes(setup, known)
     assert [one.player("a").down for one in shown] == [False, True, False, False]

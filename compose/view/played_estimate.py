@@ -59,7 +59,7 @@ class PlayedEstimate(msgspec.Struct, frozen=True):
             known.at(one.tick).truth.update(one.truth)
             known.has_truth = known.has_truth or bool(one.truth)
             for message in one.messages:
-                known.add(message, 0)
+                known.add(message)
         known.conclude(self.end)
         return known
 

@@ -26,8 +26,8 @@ def run_data(run: Run) -> RunData:
             known.add_world(run.world.ahead)
     for name, journal in run.journals.items():
         if name != WORLD_JOURNAL:
-            for message, frame in zip(journal.messages, journal.frames, strict=False):
-                known.add(message, len(frame), robot_of(name))
+            for message in journal.messages:
+                known.add(message, robot_of(name))
     if run.world is not None:
         known.add_observations(run.world.worlds)
     if run.end is not None:

@@ -33,22 +33,14 @@ Link = tuple[str, str]
 """A directed link: sender and receiver."""
 
 
-class SizedReport(msgspec.Struct, frozen=True):
-    """A report and the size of its frame."""
-
-    report: Report
-    bytes: int
-    """The size of the frame in bytes."""
-
-
 class TickData(msgspec.Struct, frozen=True):
     """The data of one tick that is known so far."""
 
     tick: int
     truth: dict[str, Pose] = msgspec.field(default_factory=dict)
     observations: dict[str, Observation] = msgspec.field(default_factory=dict)
-    reports: dict[Link, SizedReport] = msgspec.field(default_factory=dict)
-    """Reports by sender and receiver."""
+    reports: set[Link] = msgspec.field(default_factory=set)
+    """The links on which a report was sent."""
     commands: dict[str, Command] = msgspec.field(default_factory=dict)
     estimates: dict[str, Estimate] = msgspec.field(default_factory=dict)
     late: set[str] = msgspec.field(default_factory=set)
@@ -211,10 +203,8 @@ class RunData:
             now.down.add(robot)
             now.back.discard(robot)
 
-    def add(
-        self, message: Message, size: int, journal_owner: str | None = None, receiver: str | None = None
-    ) -> None:
-        """Add `message`, from a frame of `size` bytes. Data that is already known is not replaced.
+    def add(self, message: Message, journal_owner: str | None = None, receiver: str | None = None) -> None:
+        """Add `message`. Data that is already known is not replaced.
 
         `journal_owner` is the robot whose journal holds the message; None for the world's journal and for
         the network. `receiver` is that of a report from the network.
@@ -230,7 +220,7 @@ class RunData:
                 to = receiver or (
                     self._receiver(robot, tick) if journal_owner in (None, robot) else journal_owner
                 )
-                self.at(tick).reports.setdefault((robot, to), SizedReport(message, size))
+                self.at(tick).reports.add((robot, to))
                 self._add_reported(message)
             case GroundTruth(tick, poses):
                 self.at(tick).truth.update(poses)

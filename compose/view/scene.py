@@ -30,15 +30,6 @@ from protocol.mission import Role
 from protocol.motion import Controls, Covariance, Pose, travelled, wrap
 
 
-class Sent(msgspec.Struct, frozen=True):
-    """A report that a robot sends to its peer, or in a team the reports to all that are in range."""
-
-    bytes: int
-    """The size of the frame in bytes, or of all frames."""
-    through: int | None = None
-    """The last tick of the manoeuvres in the report's log; None for a planner with reports of its own."""
-
-
 class Decision(msgspec.Struct, frozen=True):
     """A robot's command until the next tick: v in m/s and omega in rad/s, with phase, state and verdict."""
 
@@ -114,7 +105,6 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
     anchors: tuple[NamedRange, ...] = ()
     """The ranges to anchors of a team."""
     contacts: tuple[Contact, ...] = ()
-    sent: Sent | None = None
     command: Decision | None = None
     held: HeldPoses | None = None
     reported: FalsePose | None = None
@@ -237,11 +227,5 @@ def player_of(
         known["reported"] = FalsePose(reported, travelled(pose, reported)) if reported is not None else None
     if command is not None:
         known["command"] = Decision(command.v, command.omega, command.phase, command.task, command.verdict)
-    if setup.team:
-        sent = [one.bytes for (sender, _), one in now.reports.items() if sender == robot]
-        known["sent"] = Sent(sum(sent)) if sent else None
-    elif peer is not None and (sized := now.reports.get((robot, peer))) is not None:
-        report = sized.report
-        known["sent"] = Sent(sized.bytes, report.through if report.body is None else None)
     held = held_poses(robot, now)
     return Player(robot, sentence, down=down, held=held, peer=peer if setup.visits else None, **known)

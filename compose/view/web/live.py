@@ -111,7 +111,7 @@ class ReceivedMission(WatchedRun):
         if tick is not None and not self._timely(tick, by_world=source.kind in OF_WORLD):
             return
         configured = len(self.known.configs)
-        self.known.add(message, len(frame), receiver=source.peer)
+        self.known.add(message, receiver=source.peer)
         if len(self.known.configs) > configured:
             order = sorted(self.known.configs)
             self.setup = of_configs(self.name, {robot: self.known.configs[robot] for robot in order})

@@ -204,7 +204,7 @@ class Recorded(WatchedRun):
         """Add frames of the journal of `robot`. Raises MalformedFrame."""
         for frame in frames:
             message = self._commands.pop(frame, None) or decode(frame, OfRobot, MAX_FRAME_BYTES)
-            self.known.add(message, len(frame), robot)
+            self.known.add(message, robot)
             self._through[path.name] = getattr(message, "tick", self._through.get(path.name, -1))
 
     def _add_world(self, frames: list[bytes], path: Path) -> None:

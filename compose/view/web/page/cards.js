@@ -1,4 +1,4 @@
-// The cards beside the plane: each robot's activity, measurements, reports, command, belief and totals.
+// The cards beside the plane: each robot's activity, measurements, command and belief.
 
 import { distance, wrap } from "./geometry.js";
 import { counted, task } from "./group.js";
@@ -136,9 +136,7 @@ class Card {
     this.error.textContent = off;
     this.error.title = range;
     this.#row("measured", measured(player, this.robot, store.stage));
-    this.#row("received", received(player));
     this.#row("command", command ? commanded(command) : "–");
-    this.#row("sent", player.sent ? sent(player.sent) : "nothing");
     this.#row("belief", held ? believed(held) : "–");
     if (truth) this.#row("true pose", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "unknown");
     else if (this.fields.has("true pose")) this.#row("true pose", "hidden");
@@ -189,20 +187,6 @@ function measured(player, robot, { team, anchors, mode }) {
   if (!player.contacts?.length) return `${odometry}${anchor}; ${alone}`;
   const contacts = player.contacts.map(([peer, range]) => `${peer} ${range === null ? "in range, not measured" : metres(range)}`);
   return `${odometry}${anchor}; ${contacts.join(", ")}`;
-}
-
-/** Returns the size of the reports sent; a log has the last tick that it contains. */
-const sent = ({ bytes, through }) => (through === undefined || through === null ? `${bytes} bytes` : `report of ${bytes} bytes, log through tick ${through}`);
-
-function received(player) {
-  return player.contacts?.map(received_from).join("; ") || "nothing";
-}
-
-function received_from([peer, , heard, damaged]) {
-  if (heard === null) return `reports of ${peer} that arrive within the tick`;  // hardware mode
-  const ticks = (list) => `${list.length > 1 ? "ticks" : "tick"} ${list.join(", ")}`;
-  const intact = heard.length ? `${peer}'s report of ${ticks(heard)}` : `nothing from ${peer}`;
-  return damaged.length ? `${intact}; damaged: report of ${ticks(damaged)}` : intact;
 }
 
 const commanded = ({ v, omega }) => (v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`);
