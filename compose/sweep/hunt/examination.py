@@ -29,6 +29,11 @@ MOST_WITHOUT_END = 750
 
 A robot that waits for what was lost waits until `max_ticks`, and each restart would replay all of it.
 """
+TWICE_EACH = 4
+"""The number of seeds of which one also runs as virtual processes, without kills, faults and bad clocks.
+
+That takes two thirds of the time of exact sensors, and shows little that an input with kills does not show.
+"""
 
 
 class Examined(msgspec.Struct, frozen=True):
@@ -50,7 +55,7 @@ def scenario_of(table: dict[str, Any]) -> tuple[Scenario, tuple[Kill, ...], dict
 
 
 def examined(table: dict[str, Any]) -> Examined:
-    """Run the input `table`, in one process and as virtual processes, and examine the run."""
+    """Run the input `table`, in one process and mostly as virtual processes, and examine the run."""
     try:
         scenario, kills, clocks = scenario_of(table)
     except UserError as error:
@@ -62,7 +67,8 @@ def examined(table: dict[str, Any]) -> Examined:
         sinks, messages, is_cut = watched(scenario, seen)
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
-    again = [] if is_cut else _again(scenario, kills, clocks, sinks)
+    alone = not (kills or clocks or scenario.faults) and scenario.seed % TWICE_EACH
+    again = [] if is_cut or alone else _again(scenario, kills, clocks, sinks)
     try:
         run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
         found, moments = reached(run)

@@ -16,16 +16,7 @@ from compose.launch.supervisor import ChildFailed
 from compose.sweep.hunt import coverage
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
-from compose.sweep.hunt.mutation import (
-    MUTATIONS,
-    WITHIN_BOUNDS,
-    Clues,
-    Table,
-    is_noisy,
-    mutated,
-    seeds,
-    simpler,
-)
+from compose.sweep.hunt.mutation import WITHIN_BOUNDS, Clues, Table, is_noisy, mutated, seeds, simpler
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
@@ -42,6 +33,8 @@ NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
 SLOWEST_SHARE = 0.2
 """The share of inputs that are changes of those that came nearest to a computed bound."""
+NEARER = 8
+"""The power of the share of its bound by which such an input is chosen: the slowest runs also take longest."""
 NOISY_SLOWER = 5.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks.
 
@@ -124,12 +117,13 @@ class Hunt:
             one = self.seeds[0] if self._guided else draw.choice(self.seeds)
             known = Clues(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
             return mutated(one, known, draw.choice(self.seeds), draw)
-        climbs = bool(self.slowest) and draw.random() < SLOWEST_SHARE
-        some = [one for _, one in self.slowest.values()] if climbs else self.corpus
-        some = some if climbs or draw.random() < 0.5 else some[-NEWEST:]
+        if self.slowest and draw.random() < SLOWEST_SHARE:
+            near = [*self.slowest.values()]
+            [(_, entry)] = draw.choices(near, [share**NEARER * one.share for share, one in near])
+            return mutated(entry.table, entry.known, entry.table, draw, WITHIN_BOUNDS)
+        some = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
         [entry] = draw.choices(some, [one.share for one in some])
-        other, changes = (entry, WITHIN_BOUNDS) if climbs else (draw.choice(self.corpus), MUTATIONS)
-        return mutated(entry.table, entry.known, other.table, draw, changes)
+        return mutated(entry.table, entry.known, draw.choice(self.corpus).table, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
         new = result.reached - self.seen
