@@ -54,8 +54,11 @@ def scenario_of(table: dict[str, Any]) -> tuple[Scenario, tuple[Kill, ...], dict
     return template.scenario, template.kills(template.scenario.seed), template.clocks
 
 
-def examined(table: dict[str, Any]) -> Examined:
-    """Run the input `table`, in one process and mostly as virtual processes, and examine the run."""
+def examined(table: dict[str, Any], *, sparing: bool = False) -> Examined:
+    """Run the input `table`, in one process and as virtual processes, and examine the run.
+
+    `sparing` leaves out the second run of most inputs without kills, faults and bad clocks.
+    """
     try:
         scenario, kills, clocks = scenario_of(table)
     except UserError as error:
@@ -67,7 +70,7 @@ def examined(table: dict[str, Any]) -> Examined:
         sinks, messages, is_cut = watched(scenario, seen)
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
-    alone = not (kills or clocks or scenario.faults) and scenario.seed % TWICE_EACH
+    alone = sparing and scenario.seed % TWICE_EACH and not (kills or clocks or scenario.faults)
     again = [] if is_cut or alone else _again(scenario, kills, clocks, sinks)
     try:
         run = of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)

@@ -34,7 +34,7 @@ NEWEST = 32
 SLOWEST_SHARE = 0.2
 """The share of inputs that are changes of those that came nearest to a computed bound."""
 NEARER = 8
-"""The power of the share of its bound by which such an input is chosen: the slowest runs also take longest."""
+"""The power of the share of its bound by which such an input is chosen: the slowest runs take longest."""
 NOISY_SLOWER = 5.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks.
 
@@ -95,7 +95,7 @@ class Hunt:
         with _pool(self._workers) as examine:
             for number in count():
                 inputs = self._batch(number)
-                for table, result in zip(inputs, examine(inputs), strict=True):
+                for table, result in zip(inputs, examine(inputs, True), strict=True):
                     self.runs += 1
                     self.refused += result.refused is not None
                     if result.breaches:
@@ -141,7 +141,7 @@ class Hunt:
         while left and tries < MOST_TRIES:
             size = min(self._workers, MOST_TRIES - tries)
             tried, left = left[:size], left[size:]
-            for smaller, result in zip(tried, examine(tried), strict=True):
+            for smaller, result in zip(tried, examine(tried, False), strict=True):
                 tries += result.refused is None
                 same = next((one for one in result.breaches if one.kind == breach.kind), None)
                 if same is not None:
@@ -169,7 +169,7 @@ class Hunt:
         return None
 
 
-Examine = Callable[[Sequence[Table]], Iterator[Examined]]
+Examine = Callable[[Sequence[Table], bool], Iterator[Examined]]
 
 
 @contextmanager
@@ -177,8 +177,8 @@ def _pool(workers: int) -> Iterator[Examine]:
     """Yield a function that examines inputs in `workers` processes, forked from this one, in their order."""
     pool = multiprocessing.get_context("fork").Pool(workers, _begin)
 
-    def examine(tables: Sequence[Table]) -> Iterator[Examined]:
-        for one in [pool.apply_async(examined, (table,)) for table in tables]:
+    def examine(tables: Sequence[Table], sparing: bool) -> Iterator[Examined]:
+        for one in [pool.apply_async(examined, (table,), {"sparing": sparing}) for table in tables]:
             try:
                 yield one.get(HANG_S)
             except multiprocessing.TimeoutError:
