@@ -27,8 +27,6 @@ MOST_TRIES = 100
 """The number of runs in which an input is shrunk at most."""
 PROCESSES_EACH = 100
 """The number of runs after which an input with kills also runs as processes."""
-SEEDS_OF_BATCH = 1
-"""The number of the first inputs in a batch, until all have run: many have noisy sensors."""
 NEWEST = 32
 """The number of the latest inputs of the corpus, of which every second input is a mutation."""
 SLOWEST_SHARE = 0.2
@@ -106,8 +104,8 @@ class Hunt:
         return None
 
     def _batch(self, number: int) -> list[Table]:
-        """Return the inputs of batch `number`: a few of the seeds while there are some, and mutations."""
-        left = self.seeds[number * SEEDS_OF_BATCH : (number + 1) * SEEDS_OF_BATCH]
+        """Return the inputs of batch `number`: one of the seeds, many of which are slow, and mutations."""
+        left = self.seeds[number : number + 1]
         draw = random.Random(f"{self._seed}/hunt/{number}")
         return [*left, *[self._input(draw) for _ in range(BATCH - len(left))]]
 
@@ -116,14 +114,14 @@ class Hunt:
         if not self._guided or not self.corpus:
             one = self.seeds[0] if self._guided else draw.choice(self.seeds)
             known = Clues(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
-            return mutated(one, known, draw.choice(self.seeds), draw)
+            return mutated(one, known, draw)
         if self.slowest and draw.random() < SLOWEST_SHARE:
             near = [*self.slowest.values()]
             [(_, entry)] = draw.choices(near, [share**NEARER * one.share for share, one in near])
-            return mutated(entry.table, entry.known, entry.table, draw, WITHIN_BOUNDS)
+            return mutated(entry.table, entry.known, draw, WITHIN_BOUNDS)
         some = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
         [entry] = draw.choices(some, [one.share for one in some])
-        return mutated(entry.table, entry.known, draw.choice(self.corpus).table, draw)
+        return mutated(entry.table, entry.known, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
         new = result.reached - self.seen

@@ -66,14 +66,9 @@ def seeds(source: str) -> list[Table]:
         if sweep.base.get("name") == source:
             every = list(cells(sweep))
             found += [copy.deepcopy(dict(one.table)) for one in every[:: -(-len(every) // CELLS_OF_SWEEP)]]
+    small = sorted(found[1:], key=lambda one: one["group"]["robots"] if "group" in one else 0)
     turn = {False: count(), True: count()}
-    return [found[0], *sorted(sorted(found[1:], key=_robots), key=lambda one: next(turn[is_noisy(one)]))]
-
-
-def _robots(table: Mapping[str, Any]) -> int:
-    """Return the number of robots of the input."""
-    drawn = table.get("group") or table.get("team") or {}
-    return int(drawn.get("robots", len(table.get("robot", ()))))
+    return [found[0], *sorted(small, key=lambda one: next(turn[is_noisy(one)]))]
 
 
 def is_noisy(table: Mapping[str, Any]) -> bool:
@@ -82,13 +77,9 @@ def is_noisy(table: Mapping[str, Any]) -> bool:
 
 
 def mutated(
-    table: Mapping[str, Any],
-    known: Clues,
-    other: Mapping[str, Any],
-    draw: random.Random,
-    changes: Mapping[Change, float] | None = None,
+    table: Mapping[str, Any], known: Clues, draw: random.Random, changes: Mapping[Change, float] | None = None
 ) -> Table:
-    """Return `table` with one to three of `changes`, or of all; parts of `other` may be taken."""
+    """Return `table` with one to three of `changes`, or of all."""
     found, weights = copy.deepcopy(dict(table)), changes or MUTATIONS
     for _ in range(draw.choice((1, 1, 2, 3))):
         changed = None
@@ -96,10 +87,6 @@ def mutated(
             [change] = draw.choices(list(weights), list(weights.values()))
             changed = change(copy.deepcopy(found), known, draw)
         found = changed
-    if draw.random() < 0.1:
-        part = draw.choice(("fault", "kill", "seed"))
-        if part in other:
-            found[part] = copy.deepcopy(other[part])
     return found
 
 
