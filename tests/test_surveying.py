@@ -152,7 +152,7 @@ def test_compiled_costs_of_manoeuvres_are_those_of_their_text_to_the_bit(seed: i
     assert np.array_equal(own_costs(*given), own_costs_by_numpy(*given))
     information = _information(of_both[0].covariance, mission)
     for moving, other in ((0, 5), (1, len(ways.v) - 1)):
-        costs = joint_costs(ways, moving, other, of_both, m2, mission, information, objective)
+        costs = joint_costs(ways, moving, other, of_both, m2, 1.0, mission, information, objective)
         text = joint_costs_by_numpy(ways, moving, other, of_both, m2, mission, objective)
         assert np.array_equal(costs, text)
 

@@ -137,14 +137,12 @@ def plan_together(
     ways = choice(mission, objective.strides)
     stand = len(ways.v) - 1
     a = b = stand
-    given = (hypotheses, m2, mission, _information(hypotheses[0].covariance, mission))
+    given = (hypotheses, m2, rho, mission, _information(hypotheses[0].covariance, mission))
     if resting != "b":
-        cost = joint_costs(ways, 1, stand, *given, objective)
-        b = _best_of(cost, ways, np.array([stand]), np.arange(stand + 1), hypotheses, rho, mission)
+        b = int(np.argmin(joint_costs(ways, 1, stand, *given, objective)))
     if resting != "a":
         of_a = objective if resting == "b" else objective._replace(standing_cost=0.0)
-        cost = joint_costs(ways, 0, b, *given, of_a)
-        a = _best_of(cost, ways, np.arange(stand + 1), np.array([b]), hypotheses, rho, mission)
+        a = int(np.argmin(joint_costs(ways, 0, b, *given, of_a)))
     return ways.controls(a), ways.controls(b)
 
 
@@ -154,42 +152,30 @@ def joint_costs(
     other: int,
     hypotheses: Sequence[PlanningHypothesis],
     m2: tuple[float, float],
+    rho: float,
     mission: Mission,
     information: Array,
     objective: Objective,
 ) -> Array:
     """Return the cost of each manoeuvre of the robot `moving` (0 or 1), (C,); see `plan_together`.
 
-    The other one executes the manoeuvre with the index `other`, and `information` is that on both poses.
+    The other one executes the manoeuvre with the index `other`, and `information` is that on both poses. The
+    cost is infinite if the safety distance might be violated, except that of the last one, which is to stand.
     """
     own_sigma = max(mission.noise.anchor_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     sigma = max(mission.noise.mutual_sigma, NEGLIGIBLE_GAIN * mission.accuracy)
     farthest, outside = FARTHEST_PLANNED * mission.sensing_range, objective.outside_cost
     by = _weighed(mission, sigma, own_sigma, farthest, outside, objective.standing_cost)
     cost = np.empty(len(ways.v))
-    given = map(address, (np.array((0.0, 0.0, *m2)), information, cost))
-    if not library().joint_costs(by, *_ways(ways), moving, other, *_poses(hypotheses), *given):
+    arrays = map(address, (np.array((0.0, 0.0, *m2)), information, cost))
+    if not library().joint_costs(by, *_ways(ways), moving, other, *_poses(hypotheses), *arrays):
         raise Singular("the information on the poses is singular")
-    return cost
-
-
-def _best_of(
-    cost: Array,
-    ways: Choice,
-    of_a: Places,
-    of_b: Places,
-    hypotheses: Sequence[PlanningHypothesis],
-    rho: float,
-    mission: Mission,
-) -> int:
-    """Return the cheapest of the manoeuvres `of_a` and `of_b` that keeps the safety distance, or to stand.
-
-    One of both has a single manoeuvre, the last one of the other is to stand; `rho` is the latest range (m).
-    """
     if mission.safety_distance:
-        cost[~_keep_apart(ways, hypotheses, rho, mission, of_a, of_b)] = np.inf
+        every, given = np.arange(len(cost)), np.array([other])
+        pairs = (given, every) if moving else (every, given)
+        cost[~_keep_apart(ways, hypotheses, rho, mission, *pairs)] = np.inf
         cost[-1] = min(cost[-1], STANDING_COST)
-    return int(np.argmin(cost))
+    return cost
 
 
 def _keep_apart(
