@@ -190,7 +190,7 @@ def _in_range(
     places = [one.place for one in anchors if one.told.id in first]
     if given is not None:
         start = given_start(given)
-        if not _reached(start, places, mission):
+        if not _reached(start, places, mission.sensing_range):
             raise BadScenario(
                 f"robot[{i}].start: no anchor that '{robot.id}' knows and may range is within "
                 f"mission.sensing_range = {mission.sensing_range:.9g} m"
@@ -198,14 +198,20 @@ def _in_range(
         if near := _too_near(start, others, mission):
             raise BadScenario(f"robot[{i}].start: {near}")
         return replace(robot, start=start)
-    draw, area = random.Random(f"{file.seed}/start/{robot.id}").random, _area(file)
+    return replace(robot, start=_drawn_start(i, file, places, others, f"an anchor of '{robot.id}'"))
+
+
+def _drawn_start(
+    i: int, file: ScenarioFile, beacons: Sequence[Anchor | Pose], others: Sequence[Pose], whose: str
+) -> Pose:
+    """Return a start in range of one of the `beacons`, which are `whose`; without any, the first one."""
+    draw, area = random.Random(f"{file.seed}/start/{file.robot[i].id}").random, _area(file)
+    reach = file.mission.diameter or file.mission.sensing_range
     for _ in range(MOST_DRAWS):
         start = Pose(*_within(area, draw(), draw()), TAU * draw())
-        if _reached(start, places, mission) and not _too_near(start, others, mission):
-            return replace(robot, start=start)
-    raise Unworkable(
-        f"robot[{i}].start: none of {MOST_DRAWS} places in the area is in range of an anchor of '{robot.id}'"
-    )
+        if (not beacons or _reached(start, beacons, reach)) and not _too_near(start, others, file.mission):
+            return start
+    raise Unworkable(f"robot[{i}].start: none of {MOST_DRAWS} places in the area is in range of {whose}")
 
 
 def given_start(given: tuple[float, float, float]) -> Pose:
@@ -229,8 +235,8 @@ def _too_near(start: Pose, others: Sequence[Pose], mission: Mission) -> str:
     return f"nearer to another one than {least:.3g} m (safety_distance)" if near else ""
 
 
-def _reached(start: Pose, places: Sequence[Anchor], mission: Mission) -> bool:
-    return any(math.hypot(start.x - at.x, start.y - at.y) <= mission.sensing_range for at in places)
+def _reached(start: Pose, places: Sequence[Anchor | Pose], reach: float) -> bool:
+    return any(math.hypot(start.x - at.x, start.y - at.y) <= reach for at in places)
 
 
 def _connected(file: ScenarioFile, robots: Sequence[RobotSpec]) -> list[RobotSpec]:
@@ -242,27 +248,16 @@ def _connected(file: ScenarioFile, robots: Sequence[RobotSpec]) -> list[RobotSpe
     diameter = file.mission.diameter
     reach = diameter or file.mission.sensing_range
     for i, robot in enumerate(file.robot):
-        if robot.start is not None:
-            starts.append(given_start(robot.start))
-            if near := _too_near(starts[-1], starts[:-1], file.mission):
-                raise BadScenario(f"robot[{i}].start: {near}")
-            continue
-        draw = random.Random(f"{file.seed}/start/{robot.id}").random
-        for _ in range(MOST_DRAWS):
-            start = Pose(*_within(_area(file), draw(), draw()), TAU * draw())
+        if robot.start is None:
             others = starts[:1] if diameter else starts
-            close = not starts or any(math.hypot(start.x - at.x, start.y - at.y) <= reach for at in others)
-            if close and not _too_near(start, starts, file.mission):
-                break
-        else:
-            raise Unworkable(f"robot[{i}].start: no place in the area is in range of another robot")
-        starts.append(start)
-    left = list(range(1, len(starts)))
-    seen = [0]
+            starts.append(_drawn_start(i, file, others, starts, "another robot"))
+            continue
+        starts.append(given_start(robot.start))
+        if near := _too_near(starts[-1], starts[:-1], file.mission):
+            raise BadScenario(f"robot[{i}].start: {near}")
+    seen, left = [0], list(range(1, len(starts)))
     for one in seen[:1] if diameter else seen:
-        met = [
-            k for k in left if math.hypot(starts[one].x - starts[k].x, starts[one].y - starts[k].y) <= reach
-        ]
+        met = [k for k in left if _reached(starts[one], starts[k : k + 1], reach)]
         seen += met
         left = [k for k in left if k not in met]
     if left and diameter:
