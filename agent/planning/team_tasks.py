@@ -287,6 +287,8 @@ def _surveying(state: TeamState) -> TeamState | None:
     mission, seen = state.config.mission, _seen(state)
     if not seen or not len(seen[0].beacons):
         return None
+    if (controls := _to_anchor(state)) is not None:
+        return state.doing_next("surveying", 3, controls)
     if state.doing == "surveying" and state.tick < state.planned + stride(mission):
         return state
     sigma = max(mission.noise.anchor_sigma, mission.noise.mutual_sigma)
@@ -294,6 +296,25 @@ def _surveying(state: TeamState) -> TeamState | None:
         mission = replace(mission, accuracy=EXACT_ACCURACY)
     controls = plan_among(seen, sigma, mission, _frame_sigma(state))
     return replace(state, planned=state.tick).doing_next("surveying", 3, controls)
+
+
+def _to_anchor(state: TeamState) -> Controls | None:
+    """Return the controls to where the robot was nearest to an anchor that too few ranges locate.
+
+    None if it has no such anchor, or is in range of it, or there.
+    """
+    part, place, ranged = state.following.part, state.place, dict[str, list[tuple[float, int]]]()
+    assert part is not None
+    assert place is not None
+    for tick, entry in enumerate(state.log.logs[state.own] if state.wanted else ()):
+        for one in entry.anchors:
+            ranged.setdefault(state.team.anchors[one.to].id, []).append((one.range, tick))
+    for name in state.wanted:
+        if name in ranged and name not in part.robots and ranged[name][-1][1] < state.tick:
+            path, (_, tick) = part.paths[place], min(ranged[name])
+            at = float(path.x[tick]), float(path.y[tick])
+            return towards(at, state.odometry, state.config.mission, ARRIVED)
+    return None
 
 
 def _seen(state: TeamState) -> list[AmongBeacons]:
@@ -308,7 +329,7 @@ def _seen(state: TeamState) -> list[AmongBeacons]:
         return []
     part = state.following.part
     assert part is not None
-    wanted = [part.robots.index(one) for one in state.wanted[:1] if one in part.robots]
+    wanted = [part.robots.index(one) for one in state.wanted if one in part.robots][:1]
     surveys = bool(wanted) and state.config.robot != state.team.origin
     if state.config.robot == state.team.origin:
         wanted = [k for k in range(len(part.robots)) if k != place]
