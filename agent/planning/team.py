@@ -38,7 +38,8 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         assert config.team is not None
         log = TeamLog.of(config.team, hearsay=not config.tolerates)
         pairs = (TeamEstimate(),) * len(config.team.robots) if config.tolerates else ()
-        return TeamState(config, log, pairs=pairs, nearest=(Near(),) * len(config.team.robots))
+        nearest = (Near(),) * (len(config.team.robots) + len(config.team.anchors))
+        return TeamState(config, log, pairs=pairs, nearest=nearest)
 
     def observe(self, state: TeamState, observation: Observation) -> TeamState:
         """Return `state` with the sensor data of one tick."""
@@ -46,10 +47,11 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         odometry, period = state.odometry, state.config.mission.period
         if driven is not None:
             odometry = step(odometry, driven.v, driven.omega, period)
-        ranges = {one.peer: one.range for one in observation.contacts if one.range is not None}
-        each = zip(state.team.robots, state.nearest, strict=True)
-        nearest = [one.ranged(ranges.get(robot), odometry, observation.tick) for robot, one in each]
-        anchor = min([one.range for one in observation.anchors], default=None)
+        ranges = {one.peer: one.range for one in observation.contacts}
+        ranges.update({one.anchor: one.range for one in observation.anchors})
+        names = *state.team.robots, *[one.id for one in state.team.anchors]
+        each = zip(names, state.nearest, strict=True)
+        nearest = [one.ranged(ranges.get(name), odometry, observation.tick) for name, one in each]
         return replace(
             state,
             tick=observation.tick,
@@ -62,7 +64,6 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
                 for one in observation.contacts
             },
             nearest=tuple(nearest),
-            anchored=state.anchored.ranged(anchor, odometry, observation.tick),
         )
 
     def report(self, state: TeamState) -> TeamReport:

@@ -53,7 +53,7 @@ class Spiral(NamedTuple):
 
 
 class Near(NamedTuple):
-    """The place of the shortest range to a robot, where both are in the same tick, or to any anchor."""
+    """The place of the shortest range to an anchor, or to a robot, where both are in the same tick."""
 
     range: float = math.inf
     """The range in m; infinite before there is one."""
@@ -100,9 +100,7 @@ class TeamState(msgspec.Struct, frozen=True):
     passing: Bypass = Bypass()
     """The way past robots that are near, if the mission has a safety distance."""
     nearest: tuple[Near, ...] = ()
-    """The place where the robot was nearest to each robot of the team."""
-    anchored: Near = Near()
-    """The place where the robot was nearest to an anchor."""
+    """The place where the robot was nearest to each robot of the team, then to each anchor."""
     joint: TeamEstimate = TeamEstimate(why_not="it has not moved yet")
     """The estimate by all measurements; in a team that tolerates false data, by the own ones alone."""
     pairs: tuple[TeamEstimate, ...] = ()

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.following import EXACT_ACCURACY, Following
+from agent.estimation.following import Following
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
@@ -215,8 +215,10 @@ def _lost(state: TeamState) -> Pose | None:
     the origin. If it has never had one, others bring it: it returns to where it had the latest range to one.
     """
     team = state.team
-    beacon = state.anchored if team.origin is None else state.nearest[team.robots.index(team.origin)]
-    if team.origin is not None and beacon.range == math.inf:
+    if team.origin is None:
+        anchors = state.nearest[len(team.robots) :]
+        beacon = min(anchors, key=lambda one: one.range)._replace(latest=max([one.latest for one in anchors]))
+    elif (beacon := state.nearest[team.robots.index(team.origin)]).range == math.inf:
         beacon = max(state.nearest, key=lambda one: (one.range < math.inf, one.latest))
     if beacon.range == math.inf or state.config.robot == team.origin:
         return None
@@ -292,8 +294,8 @@ def _surveying(state: TeamState) -> TeamState | None:
     if state.doing == "surveying" and state.tick < state.planned + stride(mission):
         return state
     sigma = max(mission.noise.anchor_sigma, mission.noise.mutual_sigma)
-    if state.team.origin is not None and mission.noise.exact:  # a claim needs more than its accuracy
-        mission = replace(mission, accuracy=EXACT_ACCURACY)
+    if state.team.origin is not None and (own := state.following.judged.get(state.config.robot)):
+        mission = replace(mission, accuracy=own.accuracy)  # with exact sensors, that of rounding
     controls = plan_among(seen, sigma, mission, _frame_sigma(state))
     return replace(state, planned=state.tick).doing_next("surveying", 3, controls)
 
@@ -303,17 +305,16 @@ def _to_anchor(state: TeamState) -> Controls | None:
 
     None if it has no such anchor, or is in range of it, or there.
     """
-    part, place, ranged = state.following.part, state.place, dict[str, list[tuple[float, int]]]()
-    assert part is not None
-    assert place is not None
-    for tick, entry in enumerate(state.log.logs[state.own] if state.wanted else ()):
-        for one in entry.anchors:
-            ranged.setdefault(state.team.anchors[one.to].id, []).append((one.range, tick))
+    part, names = state.following.part, [one.id for one in state.team.anchors]
     for name in state.wanted:
-        if name in ranged and name not in part.robots and ranged[name][-1][1] < state.tick:
-            path, (_, tick) = part.paths[place], min(ranged[name])
-            at = float(path.x[tick]), float(path.y[tick])
-            return towards(at, state.odometry, state.config.mission, ARRIVED)
+        near = state.nearest[len(state.team.robots) + names.index(name)]
+        if (
+            part is not None
+            and name not in part.robots
+            and near.latest < state.tick
+            and near.range < math.inf
+        ):
+            return towards((near.place.x, near.place.y), state.odometry, state.config.mission, ARRIVED)
     return None
 
 
