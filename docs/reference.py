@@ -396,7 +396,6 @@ def printed(scenario: str) -> str:
 TABLES: dict[str, Callable[[], str]] = {
     "results-summary": expected_tables.summary,
     "results-attacked-links": expected_tables.link_attacks,
-    "results-mutants": expected_tables.mutants,
     "results-run-noisy": partial(printed, "noisy"),
     "results-peers": peer_tables.short_table,
     "results-peers-tiers": partial(peer_tables.full_table, "TIERS"),

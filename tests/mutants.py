@@ -1,15 +1,14 @@
 """Defects that a hunt must find: `python -m tests.mutants [NAME ...] [--cpu S]`.
 
 Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used S
-seconds of processor time: with the guide, and beside it by chance alone. The table in docs/howto-hunt.md has
-after how many runs and seconds each was found, and how small the input is; docs/reference.py writes it.
+seconds of processor time: with the guide, and beside it by chance alone. A table says after how many runs and
+seconds, with those of shrinking the input, each was found, and how small the input is.
 """
 
 from __future__ import annotations
 
 import argparse
 import inspect
-import json
 import multiprocessing
 import os
 import sys
@@ -31,7 +30,6 @@ from compose.scenario import group_meetings
 from compose.sweep.hunt.exploration import FoundBreach, Hunt
 from compose.sweep.hunt.mutation import fault_lines
 from protocol.journal.journal_file import Journal
-from tests.expected.tables import MUTANTS_FOUND
 from world import scenario, tick
 from world.hardware import bridge
 
@@ -215,17 +213,17 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--guided-only", action="store_true")
     options = parser.parse_args(arguments)
     chosen = [one for one in MUTANTS if one.__name__ in (options.name or _names())]
-    rows, missed = json.loads(MUTANTS_FOUND.read_text()), 0
+    missed = 0
+    print("| mutant | guided | by chance |\n| --- | --- | --- |")
     for mutant in chosen:
-        assert mutant.__doc__ is not None
-        row = rows[mutant.__doc__.removesuffix(".")] = {}
-        for head, guided in (("guided", True), ("by chance", False))[: 1 if options.guided_only else 2]:
+        print(f"| {mutant.__name__}", end="", flush=True)
+        for guided in (True,) if options.guided_only else (True, False):
             with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as process:
-                done = process.submit(hunted, mutant, MUTANTS[mutant], options.cpu, guided=guided)
-                row[head] = done.result()
-            print(f"{mutant.__name__}, {head}: {row[head]}", flush=True)
-        missed += row["guided"].startswith(MISSED)
-        MUTANTS_FOUND.write_text(json.dumps(rows, indent=1) + "\n")
+                hunt = process.submit(hunted, mutant, MUTANTS[mutant], options.cpu, guided=guided)
+                says = hunt.result()
+            missed += guided and says.startswith(MISSED)
+            print(f" | {says}", end="", flush=True)
+        print(" |", flush=True)
     return 0 if 10 * missed <= len(chosen) else 1
 
 

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import json
 from collections import Counter
 from collections.abc import Callable, Sequence
-from pathlib import Path
 
 from compose.sweep.statistics import wilson
 from tests.expected.results import CellResults, Expected, Quantiles, read
@@ -14,8 +12,6 @@ OUTCOMES = ("localised", "undecided", "inconsistent", "wrong", "failed", "refuse
 Column = tuple[str, Callable[[Sequence[CellResults]], str]]
 POOLED_BY = {"partition": 0, "crash-2": 1, "crash": 1}
 """The index of the axis whose values are the rows, in sweeps with many equal cells; else each cell is."""
-MUTANTS_FOUND = Path(__file__).parents[2] / "docs" / "mutants.json"
-"""The results of `python -m tests.mutants`, by defect."""
 
 
 FEWEST_SHOWN = 40
@@ -92,12 +88,6 @@ def link_attacks() -> str:
         for one in file.cell
     ]
     return "\n".join(map(_line, [["attack", *outcomes], ["---"] * 5, *cells]))
-
-
-def mutants() -> str:
-    """Return the table of the defects that hunts have found, which `python -m tests.mutants` has written."""
-    rows = [[name, *one.values()] for name, one in json.loads(MUTANTS_FOUND.read_text()).items()]
-    return "\n".join(map(_line, [["defect", "guided", "by chance"], ["---"] * 3, *rows]))
 
 
 def _share(count: int, trials: int) -> str:
