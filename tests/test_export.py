@@ -37,10 +37,9 @@ from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from compose.view.drawing import LEAST_OPACITY
 from compose.view.export.folder import export
-from compose.view.foxglove.views import TRAIL_WIDTH
 from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation
-from protocol.motion import compose, wrap
+from protocol.motion import wrap
 from protocol.wire import decode
 from tests.commands import BOUND_S, TandemProcess, tandem
 from tests.doctor import complaints
@@ -138,9 +137,10 @@ def test_every_viewers_channel_decodes_with_its_own_schema(faulty: Path) -> None
     assert {topic for topic, _, _ in decoded} == topics
     assert all(schema == kind for _, schema, kind in decoded)
     ticks = len(read(faulty).ticks)
-    assert decoded["/a/body", "foxglove.SceneUpdate", "foxglove.SceneUpdate"] == ticks
+    assert decoded["/a/pose", "foxglove.PoseInFrame", "foxglove.PoseInFrame"] == ticks
     assert {name for _, name, _ in decoded} == {
-        f"foxglove.{kind}" for kind in ("FrameTransforms", "Log", "SceneUpdate")
+        f"foxglove.{kind}"
+        for kind in ("FrameTransforms", "Log", "PoseInFrame", "PosesInFrame", "SceneUpdate")
     }
 
 
@@ -153,19 +153,19 @@ def test_times_are_those_of_the_simulation(faulty: Path) -> None:
 
 def test_viewers_see_robots_where_they_were_and_their_trails(paper_1: Path) -> None:
     recording = read(paper_1)
-    bodies, transforms = seen(paper_1 / "run.mcap", "/b/body"), seen(paper_1 / "run.mcap", "/tf")
-    assert len(bodies) == len(transforms) == len(recording.ticks)
-    for moment, body, tf in zip(recording.ticks, bodies, transforms, strict=True):
-        truth, (entity,) = moment.truth.poses[1], body.entities
-        pose = entity.arrows[0].pose
-        assert (entity.frame_id, pose.position.x, pose.position.y) == ("world", truth.x, truth.y)
-        turn = pose.orientation
+    poses, trails = seen(paper_1 / "run.mcap", "/b/pose"), seen(paper_1 / "run.mcap", "/b/trail")
+    transforms = seen(paper_1 / "run.mcap", "/tf")
+    assert len(poses) == len(trails) == len(transforms) == len(recording.ticks)
+    for moment, pose, trail, tf in zip(recording.ticks, poses, trails, transforms, strict=True):
+        truth = moment.truth.poses[1]
+        assert (pose.frame_id, pose.pose.position.x, pose.pose.position.y) == ("world", truth.x, truth.y)
+        turn = pose.pose.orientation
         assert wrap(2.0 * math.atan2(turn.z, turn.w) - truth.heading) == pytest.approx(0.0, abs=1e-9)
-        trail = [len(line.points) for line in entity.lines if line.thickness == TRAIL_WIDTH]
-        assert trail == ([moment.truth.tick + 1] if moment.truth.tick else [])
+        assert str(trail.poses[-1]) == str(pose.pose)
+        assert len(trail.poses) == moment.truth.tick + 1
         frames = {one.child_frame_id: one for one in tf.transforms}
         assert set(frames) == {"a", "b", "a/anchor", "b/anchor"}
-        assert (frames["b"].translation.x, frames["b"].rotation.z) == (truth.x, turn.z)
+        assert (frames["b"].translation.x, frames["b"].rotation.z) == (truth.x, pose.pose.orientation.z)
         assert (frames["b/anchor"].translation.x, frames["b/anchor"].translation.y) == (10.0, 0.0)
 
 
@@ -181,19 +181,14 @@ def test_viewers_see_anchors_with_their_ranges_and_contact_while_there_is_any(pa
     assert linked[46:] == [True] * 3
 
 
-def test_viewers_see_the_hypotheses_of_a_robot_in_the_world(paper_1: Path) -> None:
-    run = read(paper_1)
-    assert run.setup is not None
-    frame = run.setup.robot_setup("a").frame
-    assert frame is not None
-    kinds = set()
-    for one, belief in zip(run.estimates("a"), seen(paper_1 / "run.mcap", "/a/belief"), strict=True):
-        (entity,) = belief.entities
-        expected = one.world or [compose(frame, pose) for pose in one.local]
-        shown = [(arrow.pose.position.x, arrow.pose.position.y) for arrow in entity.arrows]
-        assert shown == [(pose.x, pose.y) for pose in expected]
-        kinds.add((bool(one.local), bool(one.world)))
-    assert len(kinds) == 3  # none, in the frame of the anchor, and in the world
+def test_viewers_see_the_hypotheses_of_a_robot_in_its_own_frame(paper_1: Path) -> None:
+    held = read(paper_1).estimates("a")
+    shown = seen(paper_1 / "run.mcap", "/a/hypotheses")
+    for one, poses in zip(held, shown, strict=True):
+        expected = one.world or one.local
+        assert poses.frame_id == ("world" if one.world else "a/anchor")
+        assert [(pose.position.x, pose.position.y) for pose in poses.poses] == [(p.x, p.y) for p in expected]
+    assert {poses.frame_id for poses in shown} == {"world", "a/anchor"}
 
 
 def test_viewers_see_an_ellipse_where_there_is_a_covariance(noisy: Path) -> None:
@@ -387,7 +382,7 @@ def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.err) == (3, "tandem export: agent-b.journal is missing\n")
     assert set(exported_frames(tmp_path)) == {WORLD_JOURNAL, A}
-    assert len(seen(tmp_path / "run.mcap", "/b/body")) == 49
+    assert len(seen(tmp_path / "run.mcap", "/b/pose")) == 49
 
 
 def test_a_missing_recording_and_an_unwritable_folder_are_refused(paper_1: Path, tmp_path: Path) -> None:

@@ -10,11 +10,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from compose.cli.init import starter
 from compose.scenario.json_schema import json_schema
 from compose.scenario.scenario_tables import ScenarioFile
 from compose.scenario.shipped_files import shipped
 from compose.sweep.spec import SpecFile
+from tests.commands import tandem
 
 jsonschema = pytest.importorskip("jsonschema")
 
@@ -42,13 +42,13 @@ def test_a_mistake_does_not_fit() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_init_writes_a_valid_schema_that_explains_every_field(kind: str) -> None:
-    text = starter()[f"{kind}.schema.json"]
-    schema = json.loads(text)
+def test_the_command_prints_a_valid_schema_that_explains_every_field(kind: str) -> None:
+    ended = tandem("scenarios", "--schema", kind)
+    schema = json.loads(ended.out)
     jsonschema.Draft202012Validator.check_schema(schema)
     assert schema == json_schema(KINDS[kind])
     for name, definition in schema["$defs"].items():
         for field, found in definition["properties"].items():
             assert found.get("description"), f"{name}.{field}"
-    assert "null" not in text
-    assert "\\\\A" not in text, "not a pattern of ECMAScript"
+    assert "null" not in ended.out
+    assert "\\\\A" not in ended.out, "not a pattern of ECMAScript"

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Callable, Mapping
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 from compose.cli import arguments
@@ -43,6 +42,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--robots": arguments.names,
     "--scenario": arguments.source,
     "--runs": arguments.up_to(10**9),
+    "--schema": ("scenario", "sweep"),
     "--seed": arguments.natural,
     "--trials": arguments.up_to(10**7),
     "--window": arguments.window,
@@ -55,8 +55,9 @@ MARKS: Mapping[str, Mapping[str, Any]] = {
     "!": {"required": True},
     "+": {"action": "append", "default": []},
     "*": {"nargs": "*", "default": []},
+    "?": {"nargs": "?", "const": "scenario"},
 }
-"""The settings of arguments that are required, may be repeated, or may be several."""
+"""The settings of arguments that are required, may be repeated, may be several, or need no value."""
 
 
 class CommandEntry(NamedTuple):
@@ -82,7 +83,7 @@ class CommandEntry(NamedTuple):
         """Add the arguments to `parser`, and end its help with examples and the page."""
         lines = [" ".join(line.split()) for line in self.arguments.splitlines() if line.strip()]
         to: argparse._ActionsContainer = parser
-        for line, following in pairwise([*lines, ""]):
+        for line, following in zip(lines, [*lines[1:], ""], strict=True):
             if not line.startswith("|"):
                 to = parser.add_mutually_exclusive_group() if following.startswith("|") else parser
             words, _, text = line.removeprefix("| ").partition(": ")
@@ -219,7 +220,9 @@ COMMANDS = (
     CommandEntry(
         *("scenarios", "Run", "List the scenarios and sweeps that ship with Tandem."),
         *("tandem scenarios", "docs/howto-scenario.md"),
-        "",
+        """
+        --schema?: print the JSON Schema of scenario or sweep files instead, for editors [default: scenario]
+        """,
     ),
     CommandEntry(
         *("init", "Run", "Write a scenario, a sweep, a script and a driver to start from."),

@@ -3,19 +3,28 @@
 from __future__ import annotations
 
 import argparse
+import json
 import re
 from collections.abc import Mapping
 from itertools import takewhile
 from pathlib import Path
 
 from compose.errors import ENDED
+from compose.scenario.scenario_tables import ScenarioFile
 from compose.scenario.shipped_files import shipped
 from compose.terminal import text_width
 from protocol.output import say
 
 
-def main(_: argparse.Namespace) -> int:
-    """List the scenarios and the sweeps that ship, with the first sentence of each."""
+def main(options: argparse.Namespace) -> int:
+    """List the scenarios and the sweeps that ship, with the first sentence of each; or print a schema."""
+    if options.schema is not None:
+        from compose.scenario.json_schema import json_schema  # noqa: PLC0415  # rarely needed
+        from compose.sweep.spec import SpecFile  # noqa: PLC0415
+
+        schema = json_schema(ScenarioFile if options.schema == "scenario" else SpecFile)
+        say(*json.dumps(schema, indent=2).splitlines())
+        return ENDED
     _list(shipped())
     say("sweeps, for `tandem sweep`:")
     _list(shipped("sweep"))

@@ -17,6 +17,8 @@ from compose.view.foxglove.views import WORLD_FRAME
 from compose.view.numbers import PLOTS, PLOTTED
 from compose.view.outlines import box
 
+ROBOT_TOPICS = {"body": True, "belief": True, "pose": False, "trail": False, "hypotheses": False}
+"""The topics of a robot, and whether the scene shows them; these contain what the others have."""
 HEIGHT_MARGIN = 1.15
 """The shown height, as a multiple of the extent of the sensing ranges and orbits."""
 FAR_M = 5000.0
@@ -55,11 +57,7 @@ def layout(setup: RunSetup) -> bytes:
 def _scene(setup: RunSetup) -> fl.ThreeDeeConfig:
     """Return the scene, which follows nothing and contains all sensing ranges and orbits."""
     scene = box(setup)
-    topics = [
-        "/stage",
-        "/contact",
-        *[f"/{robot}/{name}" for robot in setup.ids for name in ("body", "belief")],
-    ]
+    shown = {f"/{robot}/{topic}": visible for robot in setup.ids for topic, visible in ROBOT_TOPICS.items()}
     frames = [WORLD_FRAME, *[frame for robot in setup.ids for frame in (robot, f"{robot}/anchor")]]
     return fl.ThreeDeeConfig(
         camera_state=fl.ThreeDeeCameraState(
@@ -77,7 +75,10 @@ def _scene(setup: RunSetup) -> fl.ThreeDeeConfig:
         follow_mode="follow-none",
         follow_tf=WORLD_FRAME,
         transforms={f"frame:{one}": fl.BaseRendererLayerSettingsTransform(visible=False) for one in frames},
-        topics={topic: fl.BaseRendererSceneUpdateTopicSettings(visible=True) for topic in topics},
+        topics={
+            topic: fl.BaseRendererSceneUpdateTopicSettings(visible=visible)
+            for topic, visible in {"/stage": True, "/contact": True, **shown}.items()
+        },
     )
 
 

@@ -18,7 +18,7 @@ from compose.view.drawing import Arrow, Entity, Rgb, anchor_frame, drawing, stan
 from compose.view.events import Event
 from compose.view.numbers import Numbers
 from compose.view.outlines import Point
-from compose.view.scene import Scene
+from compose.view.scene import Player, Scene
 from protocol.motion import ORIGIN, Pose
 
 WORLD_FRAME = "world"
@@ -48,8 +48,10 @@ class Views:
     def __init__(self, setup: RunSetup) -> None:
         self.setup = setup
         self._unit = BODY_OF_RANGE * setup.mission.sensing_range
-        self._trails: dict[str, deque[fox.Point3]] = {robot: deque(maxlen=TRAIL_POSES) for robot in setup.ids}
-        """The latest true positions of each robot. Each is converted once."""
+        self._trails: dict[str, deque[tuple[fox.Pose, fox.Point3]]] = {
+            robot: deque(maxlen=TRAIL_POSES) for robot in setup.ids
+        }
+        """The latest true poses of each robot, and their positions. Each is converted once."""
 
     def standing(self) -> Shown:
         """Return the static content: anchors, sensing ranges and orbits."""
@@ -67,8 +69,7 @@ class Views:
         for player in scene.players:
             robot_setup = self.setup.robot_setup(player.robot)
             yield Shown(f"/{player.robot}/numbers", Numbers.in_scene(scene, robot_setup, self.setup))
-            if player.pose is not None:
-                self._trails[player.robot].append(_point((player.pose.x, player.pose.y)))
+            yield from self._poses(player, at)
         entities: dict[str, list[fox.SceneEntity]] = {"/contact": []}
         for one in drawing(self.setup, scene):
             entities.setdefault(one.topic, []).append(self._entity(one, at))
@@ -91,6 +92,19 @@ class Views:
                     rotation=_turned(pose.heading),
                 )
 
+    def _poses(self, player: Player, at: fox.Timestamp) -> Iterator[Shown]:
+        """Yield the true pose of a robot, its trail, and its hypotheses."""
+        robot, trail = player.robot, self._trails[player.robot]
+        if player.pose is not None:
+            trail.append((_pose(player.pose), _point((player.pose.x, player.pose.y))))
+            pose, poses = trail[-1][0], [one for one, _ in trail]
+            yield Shown(f"/{robot}/pose", fox.PoseInFrame(timestamp=at, frame_id=WORLD_FRAME, pose=pose))
+            yield Shown(f"/{robot}/trail", fox.PosesInFrame(timestamp=at, frame_id=WORLD_FRAME, poses=poses))
+        if player.held is not None:
+            frame, poses = f"{robot}/anchor", [_pose(one) for one in player.held.poses]
+            frame = WORLD_FRAME if player.held.world else frame
+            yield Shown(f"/{robot}/hypotheses", fox.PosesInFrame(timestamp=at, frame_id=frame, poses=poses))
+
     def _entity(self, one: Entity, at: fox.Timestamp) -> fox.SceneEntity:
         """Return an entity of a drawing; the body of a robot has its trail."""
         texts = [
@@ -100,7 +114,7 @@ class Views:
         ]
         lines, cubes = [], []
         if one.topic == f"/{one.id}/body":
-            points = self._trails[one.id]
+            points = [point for _, point in self._trails[one.id]]
             lines += [_strip(points, _colour(one.rgb), TRAIL_WIDTH)] if len(points) > 1 else []
         for part in one.lines:
             colour = _colour(part.rgb, part.opacity)
