@@ -34,7 +34,7 @@ def test_help_lists_every_command_once_under_its_group() -> None:
         "Run": ["run", "replay", "scenarios", "init", "sweep", "arena", "hunt"],
         "Deploy": ["world", "agent", "robot", "keys", "containers"],
         "Analyse": ["audit", "figures", "export", "estimate", "calibrate", "watch"],
-        "Check": ["doctor", "ps", "check-driver", "check-planner"],
+        "Check": ["doctor", "ps", "check-driver", "check-planner", "completion"],
     }
 
 

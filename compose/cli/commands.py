@@ -15,6 +15,8 @@ from compose.cli import arguments
 from compose.cli.removed import another_scenario
 from compose.figures import FIGURE_FORMATS, PICTURES
 
+SHELLS = ("bash", "zsh")
+"""The shells for which there is completion."""
 VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     **dict.fromkeys(("file", "folder", "recording"), arguments.folder),
     **dict.fromkeys(("--anchors", "--config", "--keys", "--out"), arguments.folder),
@@ -25,6 +27,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "others": another_scenario,
     "planners": arguments.planner,
     "scenario": arguments.source,
+    "shell": SHELLS,
     "--address": arguments.address,
     "--confidence": arguments.confidence,
     "--days": arguments.up_to(36_500),
@@ -422,6 +425,11 @@ COMMANDS = (
         {SEED}
         --fault FAULT+: fault of the radio, such as 'a->b: loss=0.3, delay=0..3'; may be repeated
         """,
+    ),
+    CommandEntry(
+        *("completion", "Check", "Print a script with which bash or zsh completes `tandem`."),
+        *("tandem completion bash", "docs/command-line.md"),
+        "shell: the shell that runs the script",
     ),
 )
 """All commands, in the order of `tandem --help`."""

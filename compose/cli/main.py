@@ -143,23 +143,6 @@ def command_parser(command: CommandEntry) -> CommandParser:
     return parser
 
 
-def whole_parser() -> CommandParser:
-    """Return a parser of all commands, of which the package `shtab` makes completions for shells."""
-    tandem = CommandParser(prog="tandem", description=DESCRIPTION)
-    commands = tandem.add_subparsers()
-    for command in COMMANDS:
-        parser = commands.add_parser(command.name, help=command.summary)
-        command.add_arguments(parser)
-        for action in parser._actions:
-            if action.choices is None and action.nargs != 0:
-                action.complete = FILE_NAMES  # type: ignore[attr-defined]
-    return tandem
-
-
-FILE_NAMES = {"bash": "_shtab_compgen_files", "zsh": "_files", "tcsh": "f"}
-"""The functions of shtab's scripts that complete the names of files, by shell."""
-
-
 def _split(arguments: Sequence[str]) -> tuple[CommandEntry, Sequence[str]]:
     """Return the command that `arguments` name, and the words after it.
 

@@ -15,7 +15,6 @@ REMOVED = {
     "export --gif": "use `--html`, whose page plays the mission",
     "export --mp4": "use `--html`, whose page plays the mission",
     "bench": "`uv run python -m tests.benchmark` in a clone measures the same",
-    "completion": "`shtab compose.cli.main.whole_parser` prints the script, also for zsh and tcsh",
     "estimate --all-anchors": "all anchors are used without it",
     "run SCENARIO SCENARIO": "a loop of the shell runs several files",
     "run --seed N..N": "`tandem sweep` runs many seeds, with one table",
