@@ -209,7 +209,7 @@ def test_what_is_drawn_is_within_its_interval_and_starts_are_within_range() -> N
         ('field = "mission.period"\nlog_uniform = [0, 1]', "draw[0]: 0 to 1 is not an interval above 0"),
         (
             'field = "mission.peroid"\nuniform = [1, 2]',
-            "'mission.peroid': mission has no field",
+            "'mission.peroid': mission: unknown field 'peroid'; did you mean 'period'?",
         ),
         (
             'field = "mission.period"\nuniform = [1, 2]\ntimes = ["max_ticks"]',
