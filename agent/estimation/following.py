@@ -34,7 +34,7 @@ from agent.estimation.judged import Judged, User, misfit, of_joint
 from agent.estimation.posterior import NO_HYPOTHESES, Posterior, carried, certainties, ended, settled
 
 SEARCHED_AT = tuple(8 * 2**n for n in range(16))
-"""The numbers of ranges, of a pair of mutual ones, at which the whole plane is searched again.
+"""The numbers of ranges (of a pair: of mutual ranges) at which the whole plane is searched again.
 
 They only bound how long a missed hypothesis stays missed: the plane is also searched before each first claim.
 More searches cost time; with fewer, robots plan with too few hypotheses.

@@ -1,5 +1,6 @@
 /* `track` of odometry_noise.py, the initial guesses of anchor_guesses.py and placement_guesses.py, the likelihood of
-   detections.py, `same` of posterior.py, and the costs of active_sensing.py. These explain them, and have the constants.
+   detections of evidence.py, `same` of posterior.py, `to_second_order` of planning_hypotheses.py, and the costs of
+   active_sensing.py. These explain them, and have the constants.
 
    Sums over ranges are those of numpy (`summed`), so that the results are the same to the bit. */
 
@@ -609,8 +610,8 @@ void same_poses(Index robots, const double *one, const double *other, const doub
 
 /* --- poses to second order ----------------------------------------------------------------------------------- */
 
-/* Add to the mean and the covariance of the poses of a and b what ranges and bearings of second order add. `seen` has x, y,
-   the range (m) and its square of b from M2, and those of a from b. */
+/* Add the terms of second order in ranges and bearings to the mean and the covariance of the poses of a and b. `seen` has
+   the x, the y, the range (m) and its square, of b from M2 and then of a from b. */
 void second_order(const double *seen, double *mean, double *covariance)
 {
     double rows[24] = {0.0}, columns[24], by_rows[24], polar[16], second[96] = {0.0}, curved[96], turned[96], more[36];
@@ -651,10 +652,10 @@ void second_order(const double *seen, double *mean, double *covariance)
 
 /* --- the costs of manoeuvres ------------------------------------------------------------------------------- */
 
-/* What costs depend on, besides the hypotheses: lengths (m), the sigma of ranges (m) and `own` of those to anchors, which
-   is a variance for a robot alone, the squared accuracy, and costs per m. */
+/* What costs depend on, besides the hypotheses: lengths (m), the sigma of mutual ranges (m), the sigma and the variance of
+   ranges to anchors, the squared accuracy, and costs per m; `confused` and `standing` are costs. */
 typedef struct {
-    double reach, sigma, own, accuracy, far_predicted, gap_sigma, largest_gap, confused;
+    double reach, sigma, anchor_sigma, anchor_variance, squared_accuracy, far_predicted, gap_sigma, largest_gap, confused;
     double farthest, nearest, nearest_to_anchor, outside, near, standing;
 } Weighed;
 
@@ -685,8 +686,8 @@ static double confusion(const Weighed *by, Index hypotheses, const double *proba
     return by->confused * remaining;
 }
 
-/* Set the costs of `count` manoeuvres of a robot about its anchor, the last of which is to stand; `margins` are those
-   (m) within the largest allowed distance, and `information` is that on the position. */
+/* Set the costs of `count` manoeuvres of a robot about its anchor, the last of which is to stand. By each hypothesis, it
+   has to stay nearer than `farthest` by one of `margins` (m); `information` is that on its position. */
 void own_costs(const Weighed *by, Index count, Index strides, const double *along, const double *across,
                Index hypotheses, const double *probability, const double *poses, const double *margins,
                const double *information, double *cost)
@@ -700,14 +701,14 @@ void own_costs(const Weighed *by, Index count, Index strides, const double *alon
         }
         for (Index t = 0; t < strides; t++) {
             const double ux = x[t] / distance[t], uy = y[t] / distance[t];
-            const double weight = (distance[t] <= by->reach) / by->own;
+            const double weight = (distance[t] <= by->reach) / by->anchor_variance;
             terms[0][t] = weight * ux * ux;
             terms[1][t] = weight * ux * uy;
             terms[2][t] = weight * uy * uy;
         }
         const double xx = information[0] + summed(terms[0], strides), xy = information[1] + summed(terms[1], strides);
         const double yy = information[3] + summed(terms[2], strides);
-        cost[n] = (xx + yy) / larger(xx * yy - xy * xy, 1e-300) / by->accuracy;
+        cost[n] = (xx + yy) / larger(xx * yy - xy * xy, 1e-300) / by->squared_accuracy;
         cost[n] += confusion(by, hypotheses, probability, strides, distance);
         if (n == count - 1) cost[n] += by->standing;
         for (Index h = 0; h < hypotheses; h++) {
@@ -732,7 +733,8 @@ static int add_variance(const Weighed *by, Index strides, const double *pose, co
             const double sign = i ? -1.0 : 1.0, at_x = x[i * strides + t], at_y = y[i * strides + t];
             const double lx = at_x - pose[3 * i], ly = at_y - pose[3 * i + 1];
             const double ox = at_x - anchors[2 * i], oy = at_y - anchors[2 * i + 1];
-            const double rho = larger(length(ox, oy), SIGMA_FLOOR), own = (rho <= by->reach) / rho / by->own;
+            const double rho = larger(length(ox, oy), SIGMA_FLOOR);
+            const double own = (rho <= by->reach) / rho / by->anchor_sigma;
             double *mutual = rows[t] + 3 * i, *to_anchor = rows[(i + 1) * strides + t] + 3 * i;
             mutual[0] = sign * nx * weight;
             mutual[1] = sign * ny * weight;
@@ -755,13 +757,13 @@ static int add_variance(const Weighed *by, Index strides, const double *pose, co
         double variance = own[0] + own[7];
         variance += (dx * dx + dy * dy) * own[14];
         variance += 2.0 * (dx * own[8] - dy * own[2]);
-        *cost += variance / by->accuracy;
+        *cost += variance / by->squared_accuracy;
     }
     return 1;
 }
 
-/* Set the costs of `count` manoeuvres of the robot `moving` (0 or 1) while the other one executes the one with the index
-   `other`. Returns 0 if a matrix is singular. */
+/* Set the costs of `count` manoeuvres of the robot `moving` (0 or 1) while the other one executes that with the index
+   `other`; returns 0 if the information is singular. */
 int joint_costs(const Weighed *by, Index count, Index strides, const double *along, const double *across, Index moving,
                 Index other, Index hypotheses, const double *probability, const double *poses, const double *anchors,
                 const double *information, double *cost)

@@ -56,8 +56,8 @@ would need 11. With fewer ranges, claims are too often wrong; with more, each mi
 EXACT_RANGES = 5
 """The number of ranges from different places with which a robot of an exact team without anchors claims.
 
-Three leave a few poses, with a false one of which two more agree to 1e-6 m only by chance. With 8, two robots
-take 7 instead of 4 ticks in the median; with 4, no fewer.
+Three ranges leave a few poses, and two more agree with a false one to 1e-6 m only by chance. With 8 ranges,
+two robots take 7 instead of 4 ticks in the median; with 4, no fewer.
 """
 
 ENOUGH_FOR_HEADING = 20

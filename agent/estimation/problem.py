@@ -68,17 +68,18 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         ticks = max(lengths, default=0)
         tick = np.minimum(ranges.tick, ticks)
         in_order = not (tick[1:] < tick[:-1]).any()  # as those of a robot alone are
-        order = back = np.arange(len(tick)) if in_order else tick.argsort(kind="stable")
+        order = back = np.arange(len(tick))
+        rows: slice | Places = slice(None)
         if not in_order:
+            rows = order = tick.argsort(kind="stable")
             back = np.empty_like(order)
             back[order] = np.arange(len(order))
-        some = slice(None) if in_order else order
-        tick, radio, rho = tick[some], ranges.radio[some], ranges.rho[some]
-        holding, common = radio < 0, ranges.common_errors(priors)[some]
+        tick, radio, rho = tick[rows], ranges.radio[rows], ranges.rho[rows]
+        holding, common = radio < 0, ranges.common_errors(priors)[rows]
         common[holding] = 0.0
-        numbers = ranges.numbers
-        if numbers != list(range(len(numbers))):
-            radio = np.where(holding, -1, np.searchsorted(numbers, radio))  # without gaps
+        radios = ranges.radios
+        if radios != list(range(len(radios))):
+            radio = np.where(holding, -1, np.searchsorted(radios, radio))  # without gaps
         v, omega, slip = _velocities(measured.paths, ticks)
         anchor, anchors = _unsure_anchors(ranges) if priors.survey_error else (np.full(len(order), -1), 0)
         white = _variances(measured, v, omega)
@@ -95,19 +96,19 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             stray=stray,
             patterns=constant_errors(v, omega, noise),
             begin=tick.searchsorted(np.arange(ticks + 2)),
-            first=ranges.first[some],
-            second=ranges.second[some],
-            place=ranges.place[some],
+            first=ranges.first[rows],
+            second=ranges.second[rows],
+            place=ranges.place[rows],
             rho=rho,
             common=common,
             scaled=-1 if not priors.range_scale or few else SCALE_AFTER_BIAS * bool(priors.range_bias),
             scale=priors.range_scale,
             delayed=common.shape[1] - 1 if priors.range_delay else -1,
-            anchor=anchor[some],
+            anchor=anchor[rows],
             anchors=anchors,
             survey=priors.survey_error,
             radio=radio,
-            radios=len(numbers) if priors.slow_sigma else 0,
+            radios=len(radios) if priors.slow_sigma else 0,
             slow=priors.slow_sigma**2,
             decay=math.exp(-measured.period / priors.slow_time),
             mean=np.zeros(3 * n) if prior is None else prior.mean.ravel(),
@@ -116,7 +117,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         )
         by = Weighing.of(
             noise,
-            ranges.sigma[some],
+            ranges.sigma[rows],
             holding.astype(np.intp),
             radio.argsort(kind="stable"),
             float(rho[~holding].max(initial=SIGMA_FLOOR)),

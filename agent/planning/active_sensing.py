@@ -108,7 +108,7 @@ def own_costs(
     if limit is None:
         sigmas = [math.sqrt(max(0.0, float(np.trace(one.covariance)))) for one in hypotheses]
         margins, loss, limit = np.minimum(sigmas, 0.1 * reach), OUTSIDE_COST_ALONE, reach
-    by = _weighed(mission, sigma, sigma**2, limit, loss, objective.standing_cost)
+    by = _weighed(mission, sigma, sigma, limit, loss, objective.standing_cost)
     information, cost = _information(hypotheses[0].covariance, mission), np.empty(len(ways.v))
     given = map(address, (margins, information, cost))
     library().own_costs(by, *_ways(ways), *_poses(hypotheses), *given)
@@ -203,14 +203,15 @@ def _keep_apart(
 
 
 def _weighed(
-    mission: Mission, sigma: float, own: float, farthest: float, outside: float, standing: float
+    mission: Mission, sigma: float, anchor_sigma: float, farthest: float, outside: float, standing: float
 ) -> Any:
-    """Return `Weighed` of hypotheses.c; `own` is as there."""
+    """Return `Weighed` of hypotheses.c."""
     reach = mission.sensing_range
+    sigmas = (sigma, anchor_sigma, anchor_sigma**2)
     of_confusion = (FARTHEST_PREDICTION * reach, SIGMA_FACTOR * sigma, LARGEST_GAP, CONFUSION_COST)
     lengths = (farthest, NEAREST * reach, NEAREST_TO_ANCHOR * reach)
     costs = (outside, OUTSIDE_COST, standing)
-    return address(np.array((reach, sigma, own, mission.accuracy**2, *of_confusion, *lengths, *costs)))
+    return address(np.array((reach, *sigmas, mission.accuracy**2, *of_confusion, *lengths, *costs)))
 
 
 def _ways(ways: Choice) -> tuple[Any, ...]:

@@ -259,7 +259,7 @@ def _normal(chi2: float, free: int) -> float:
     return float(((max(chi2, 0.0) / free) ** (1.0 / 3.0) - (1.0 - spread)) / math.sqrt(spread))
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=2)  # both robots of one process ask for it
 def _distance_score(fitted: Fit, pair: JointMeasurements) -> float:
     """Return by how many sigmas the ranges favour another distance of the anchors (score test, Rao 1948)."""
     of, walk = fitted.problem.measured, fitted.linear.walk

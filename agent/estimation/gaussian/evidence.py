@@ -1,4 +1,4 @@
-"""The evidence for a fit: against ranges that have nothing to do with each other, and by the detections."""
+"""The evidence for a fit: the Bayes factor against unrelated ranges, and the likelihood of the detections."""
 
 from __future__ import annotations
 

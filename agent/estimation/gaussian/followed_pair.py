@@ -65,7 +65,7 @@ def followed(knowledge: Knowledge) -> FollowedPair:
 
 @lru_cache(maxsize=2)
 def _shared(measured: JointMeasurements) -> JointMeasurements:
-    """Return `measured`, or the same that the other robot of one process has, with what follows from them."""
+    """Return `measured`, or equal ones of the other robot in this process, with what they already cache."""
     return measured
 
 

@@ -72,15 +72,15 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     """
 
     @cached_property
-    def numbers(self) -> list[int]:
-        """The index of each pair of radios that has ranges, ascending."""
+    def radios(self) -> list[int]:
+        """The values of `radio` that occur, ascending, without -1."""
         # numpy.unique would import numpy.ma in the first search of a mission
         return sorted(set(self.radio.tolist()) - {-1})
 
     @cached_property
     def pairs(self) -> list[NDArray[np.bool]]:
         """The ranges of each pair of radios that has some; shapes (N,)."""
-        return [self.radio == one for one in self.numbers]
+        return [self.radio == one for one in self.radios]
 
     @cached_property
     def of_anchors(self) -> dict[int, list[Places]]:
@@ -98,7 +98,7 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         multiplies the measured ranges: then the effects are the same under each guess. The column of the
         delay is in s: its effect is minus the range rate (see `smoother`).
         """
-        rho, radios = self.rho, self.numbers if priors.pair_bias else []
+        rho, radios = self.rho, self.radios if priors.pair_bias else []
         size = bool(priors.range_bias) + bool(priors.range_scale) + len(radios) + bool(priors.range_delay)
         found, column = np.empty((len(rho), size)), 0
         if priors.range_bias:
@@ -317,7 +317,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         Which of the older ones are left changes only when their number doubles. Of many pairs of robots,
         fewer are left (see MOST_MUTUAL_RANGES).
         """
-        ranges, pairs = self.ranges, len(self.ranges.numbers)
+        ranges, pairs = self.ranges, len(self.ranges.radios)
         if most is None:
             correlated = self.noise.wanders or self.noise.priors.slow_sigma > 0.0
             most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
@@ -365,8 +365,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         """Return the measurements of one robot near its anchor, which is the origin.
 
         One anchor does not tell the heading at tick 0: it is held at 0, so the axes are those of the
-        odometry. Where the anchor should be does not matter, so there is no surveying error.
-        Those of each robot are kept, with their problem.
+        odometry. Where the anchor should be does not matter, so there is no surveying error. The result for
+        each robot is kept, and so is what it caches.
         """
         known: dict[int, JointMeasurements] = self.__dict__.setdefault("of_each", {})
         if robot not in known:
@@ -374,6 +374,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         return known[robot]
 
     def _alone(self, robot: int) -> JointMeasurements:
+        """Return the measurements of `alone`, which keeps them."""
         own = self.ranges.rows(self.ranges.to_anchors(robot))
         nothing = np.zeros(len(own.rho), np.intp)
         ranges = msgspec.structs.replace(own, first=nothing, place=np.zeros((len(nothing), 2)), radio=nothing)

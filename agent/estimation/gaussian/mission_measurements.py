@@ -103,7 +103,7 @@ def _within(ranges: Sequence[Ranged], first: int, through: int) -> tuple[Listed,
 
 
 def own_measurements(knowledge: Knowledge) -> JointMeasurements:
-    """Return the odometry of the robot and its ranges to its anchor, without those that do not count."""
+    """Return the odometry of the robot and its ranges to its anchor: those that count, thinned."""
     mission, now = knowledge.config.mission, knowledge.tick
     first = beginning(knowledge, now) if knowledge.config.role == "a" else 0
     ranges, silent = _within(knowledge.log.ranges, first, now)

@@ -96,8 +96,9 @@ class Encounter(NamedTuple):
     def begun(self, own: Fit, z: Array) -> tuple[Array, tuple[Errors, ...]]:
         """Return the anchor (m) and the odometry errors for the whitened offset `z`, shape (3,).
 
-        Sweeps have the same results if fits begin without them. But of 1 524 pairs of which a had driven 30 m
-        with a wandering gyro, and without any range, the search missed the truth of 26, and not of 11.
+        Sweeps have the same results if fits begin without these errors. But of 1 524 pairs in which a had
+        driven 30 m without a range, with a wandering gyro, the search misses the truth of 11 with them, and
+        of 26 without.
         """
         weights = product(self.inverse, z[:, None])[:, 0]
         anchor = own.guess[:2] - product(self.of_anchor[:2], weights[:, None])[:, 0]
