@@ -137,7 +137,7 @@ class Agenda(msgspec.Struct, frozen=True):
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""
     alone: bool = False
-    """True if it has no anchor, or is at it, or on its way there, in no meeting until a visitor comes."""
+    """True if the robot waits at its anchor for a visitor, or drives there to wait, or has no anchor."""
     visiting: bool = False
     """True if the present meeting is a visit: the robot knows its pose already."""
     unmet: int = 0

@@ -113,7 +113,7 @@ class Contacted(msgspec.Struct, frozen=True):
 
 
 def _kept(state: RobotState) -> int:
-    """Return the ticks after which a range counts no more, and a silent finder is forgotten."""
+    """Return the ticks for which a range counts, and after which a silent finder is forgotten."""
     return 2 * contact_ticks(state.config.mission)
 
 

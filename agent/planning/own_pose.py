@@ -78,7 +78,7 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
 
 
 def contradiction(state: RobotState, claim: Localised) -> str | None:
-    """Return by how much the present `claim` contradicts the pose that the robot knows; None if it does not.
+    """Return in words by how much the present `claim` contradicts the known pose; None if it does not.
 
     The claims of robots with exact sensors have no covariance, and are never wrong.
     """

@@ -1,6 +1,7 @@
 """Phase 2: the way to the orbit about the own anchor, and the orbit until the robots meet (Section III.B).
 
-A robot whose pose is corrected by ranges to its anchor follows by pursuit; b takes some ranges as it waits.
+A robot whose pose is corrected by ranges to its anchor follows its orbit by pursuit; b takes ranges as it
+waits.
 """
 
 from __future__ import annotations
@@ -50,10 +51,7 @@ def aligning(state: RobotState) -> Aligning:
 
 
 def continued(state: RobotState, task: Orbital | None = None, ranged: bool = False) -> RobotState:
-    """Continue phase 2 from `task`, or begin it, `ranged` or not.
-
-    A robot whose pose is corrected follows its orbit by pursuit.
-    """
+    """Continue phase 2 from `task`, or begin it. A robot whose pose is corrected drives by pursuit."""
     del ranged
     task = onward(state, task or aligning(state))
     if isinstance(task, Orbiting) and state.estimator.corrects_poses:

@@ -52,7 +52,7 @@ LOST_AFTER = 3
 
 
 def homeward(state: RobotState, task: Homing) -> RobotState:
-    """Return `state` after a tick of `task` without a range: at the place, on a spiral or as at the start."""
+    """Return `state` after a tick of `task` without a range; at its place, with a spiral or a straight."""
     if drive.way_to(state, task.place) is not None:
         return state
     if task.side is None:
@@ -66,7 +66,7 @@ def is_lost(state: RobotState, strides: int = LOST_AFTER) -> bool:
 
 
 def turned_back(state: RobotState) -> RobotState:
-    """Drive back to the place of the last anchor range, and discard all hypotheses."""
+    """Return `state` without hypotheses, on the way back to the place of the last anchor range."""
     last_range_tick = state.log.ranges[-1].tick
     place = state.log.pose(ORIGIN, last_range_tick, state.config.mission.period)
     own_anchor = replace(state.own_anchor, hypotheses=())

@@ -63,13 +63,15 @@ class Resected(msgspec.Struct, frozen=True):
         if not isinstance(state.task, Looping):  # a robot that comes back may have corrected its pose
             places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
         for report in reports:
-            key = report.robot, report.prior.tick if report.prior is not None else -1
-            if report.prior is None or report.robot in self.candidates or key in places:
+            if (prior := report.prior) is None or report.robot in self.candidates:
                 continue
-            there = report.prior.pose.x, report.prior.pose.y
+            key = report.robot, prior.tick
+            if key in places or prior.tick <= max(self.since, state.tick - KEPT):
+                continue
             for one in state.ranges_to(report.robot)[-KEPT:]:
-                if one.tick == report.prior.tick > max(self.since, state.tick - KEPT):
-                    places[key] = RangedPlace(there, _moved(state, self.base, one.tick), one.range)
+                if one.tick == prior.tick:
+                    moved = _moved(state, self.base, one.tick)
+                    places[key] = RangedPlace((prior.pose.x, prior.pose.y), moved, one.range)
         if places.keys() != self.places.keys():
             state, found = _resected(state, replace(self, places=places))
             state = state.with_agenda(found=found)

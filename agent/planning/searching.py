@@ -174,11 +174,9 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single
     meeting is then withdrawn. If several meetings agree on the claim, there is no reference.
     """
-    fix, off = (
-        state.agenda.fix,
-        own_pose.contradiction(state, Localised(reference.pose, reference.covariance)),
-    )
+    fix = state.agenda.fix
     assert fix is not None
+    off = own_pose.contradiction(state, Localised(reference.pose, reference.covariance))
     if off is None:
         return _with_reference(state, reference)
     if len(fix.peers) > 1:

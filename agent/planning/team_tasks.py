@@ -177,7 +177,7 @@ def _alone(state: TeamState) -> bool:
 def _joining(state: TeamState) -> TeamState | None:
     """Return `state`, in a team without anchors, on its way to a robot that has no result.
 
-    Without one itself, it goes to any other one, which returns to where both were nearest, too.
+    A robot that has none itself also goes to those that have one: they return to where both were nearest.
     """
     others = state.waiting if state.verdict else [*state.waiting, *sorted(state.log.done)]
     lost = [state.nearest[one].place for one in others if state.nearest[one].range < math.inf]
