@@ -60,7 +60,7 @@ _ANY = object()
 
 
 def _check(base: Mapping[str, Any], walked: Sequence[str | int], value: object) -> None:
-    """Raise NoSuchField if a field of `base` with that path is unknown, or its table lacks others."""
+    """Raise NoSuchField if `base` with this `value` has an unknown field, or a table lacks a required one."""
     try:
         msgspec.convert(with_value(base, tuple(walked), value), ScenarioFile)
     except msgspec.ValidationError as error:

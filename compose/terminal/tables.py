@@ -40,23 +40,22 @@ def widest(
 ) -> tuple[list[str], Sequence[str]]:
     """Return the lines of a table with the first of the `choices` of right columns that fits the terminal.
 
-    The second value is that choice. If none fits, the lines are those of a list of the first one, with an
-    entry for each row. A row has the cells of the columns `left`, and those of the others by heading.
+    The second value is that choice. If none fits, the lines are a list with the first one, an entry for each
+    row. A row has the cells of the columns `left`, and the texts of the others by their headings.
     """
     for columns in choices:
         found = lines(table(left, columns, [(*cells, *map(texts.get, columns)) for cells, texts in rows]))
         if max(map(cell_len, found), default=0) <= room():
             return found, columns
-    entries = [
-        f"{', '.join(map(' '.join, zip(left, cells, strict=True)))}: "
-        f"{'; '.join([f'{one} {texts[one]}' for one in choices[0]])}"
-        for cells, texts in rows
-    ]
-    return [line for entry in entries for line in wrapped(entry, 2)], choices[0]
+    listed: list[str] = []
+    for cells, texts in rows:
+        name = ", ".join([" ".join(one) for one in zip(left, cells, strict=True)])
+        listed += wrapped(f"{name}: {'; '.join([f'{one} {texts[one]}' for one in choices[0]])}", 2)
+    return listed, choices[0]
 
 
 def shown(left: Sequence[str], right: Sequence[str], rows: Iterable[Sequence[str]]) -> list[str]:
-    """Return the lines of a table, or of a list if the terminal is too narrow; headings differ."""
+    """Return the lines of a table, or of a list if the terminal is too narrow. All headings differ."""
     first = len(left)
     found = [(row[:first], dict(zip(right, row[first:], strict=True))) for row in rows]
     return widest(left, [right], found)[0]

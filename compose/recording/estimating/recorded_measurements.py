@@ -91,7 +91,7 @@ class MeasuredRobot(NamedTuple):
     """The anchors to which it has ranges, that with the most first; there may be none."""
     sound: SoundOdometry
     unseen: UnseenMotion
-    """The motion of its antenna within increments."""
+    """The deviation of its antenna from the arcs of its increments."""
 
     @property
     def id(self) -> str:
@@ -319,7 +319,7 @@ def _ranges(
 ) -> Iterator[MeasuredRow]:
     """Yield the ranges in the plane between robots and to their `anchors`, each at the nearest tick.
 
-    The sigma of a range within increments is that of the range and of the `unseen` motion of its robots.
+    The variance of a range within increments includes that of the `unseen` motion of its robots.
     """
     ranges, count, noise = steps.ranges, len(used.robots), assumed.noise
     heights = np.array([*[one.antenna[2] for one in used.robots], *[one.height for one in used.anchors]])

@@ -117,8 +117,8 @@ def _result(
     posed = [one for one in measured.robots if not without[one.id]]
     unseen = {one.id: one.unseen.sigmas(np.array([t]))[0] for one in posed}
     fits = [with_told_priors(each.fit) for each in found.hypotheses]
-    far = {name: far_between(fits[0], place[name], one, accuracy) for name, one in unseen.items()}
-    reasons = {name: reason or far.get(name, "") for name, reason in reasons.items()}
+    blocking = {name: why_unseen_blocks(fits[0], place[name], one, accuracy) for name, one in unseen.items()}
+    reasons = {name: reason or blocking.get(name, "") for name, reason in reasons.items()}
     without = {name: why for name, why in without.items() if why}
     reason = [f"{one.id}: {reasons[one.id]}" for one in posed if reasons.get(one.id)]
     reason += [f"{name} is undetermined: {why}" for name, why in without.items()]
@@ -162,10 +162,10 @@ def _centre(
     return pose, centred @ (fit.covariance[own, own] + more) @ centred.T
 
 
-def far_between(fit: Fit, k: int, unseen: Numbers, accuracy: float) -> str:
-    """Return why the pose of robot `k` is too inaccurate with its `unseen` motion; empty if it is not.
+def why_unseen_blocks(fit: Fit, k: int, unseen: Numbers, accuracy: float) -> str:
+    """Return why the `unseen` motion of robot `k` makes its pose too inaccurate; empty if it does not.
 
-    `accuracy` is the largest sigma (m) of a position that may be claimed.
+    `unseen` has its sigmas (m, rad), and `accuracy` is the largest sigma (m) of a position that is claimed.
     """
     x, y, heading = np.diagonal(fit.covariance)[3 * k : 3 * k + 3].tolist()
     away, turned = unseen.tolist()

@@ -13,7 +13,7 @@ FEWEST_WINDOWS = 3
 """The number of windows from which on they tell how far a robot is from its arcs."""
 
 UNKNOWN, UNKNOWN_TURN = 0.25, 0.5
-"""The sigmas before that is known: a part of the way of the increment, and a turn in rad."""
+"""The sigmas with fewer windows: of a position, relative to the increment's way; of a heading in rad."""
 
 LONGEST_S = 64.0
 """The length in s of the longest windows: over longer increments, there are no estimates."""
@@ -31,8 +31,8 @@ class Deviations(NamedTuple):
 class UnseenMotion(NamedTuple):
     """The deviation of a robot from the arcs of constant speeds that its increments are taken for.
 
-    Its odometry tells it: from the motion over a window of several increments, the arc across it says where
-    the robot was in the middle, and the increments say where it was indeed.
+    It is measured on the odometry itself. Over a window of several increments, the pose in the middle by the
+    increments is compared with that on the one arc that joins both ends of the window.
     """
 
     odometry: RobotOdometry
