@@ -207,7 +207,7 @@ def test_a_claim_that_the_world_keeps_after_it_is_withdrawn_is_found(monkeypatch
     assert (result.breaches, result.refused) == ((), None)
     assert "localised/3/open -> aligning/2/open" in result.reached
     for module in (tick, run):
-        monkeypatch.setattr(module, "verdicts_after", tick.verdicts_after)  # it is the one of before again
+        monkeypatch.setattr(module, "verdicts_after", tick.verdicts_after)  # restored after the test
     mutants.kept()
     assert [one.kind for one in examined(table).breaches] == ["withdrawn claim"]
 

@@ -29,7 +29,7 @@ FEWEST_PLACES = 5
 
 
 class UnanchoredPlanner(LogPlanner):
-    """The planner of a robot without an anchor, in whose one meeting `GroupPlanner` lets it decide."""
+    """The planner of a robot without an anchor: `GroupPlanner` asks it to decide in the one meeting."""
 
     REQUIRED_PLACES = FEWEST_PLACES
 

@@ -1,4 +1,4 @@
-// What the drawings over time have in common: their canvases, the colours of the page, round numbers, and the pointer.
+// The parts that drawings share: canvases, the colours of the page, round numbers, and the pointer.
 
 import { unit } from "./pen.js";
 
@@ -34,7 +34,7 @@ export function rounded_up(value, factors = [1, 2, 5, 10]) {
   return factors.find((factor) => factor * power >= value) * power;
 }
 
-/** Writes the numbers of ticks from `first` to `last`, of which `x` returns the place, at least `apart` from each other. */
+/** Writes numbers of ticks from `first` to `last` at the places that `x` returns, at least `apart` from each other. */
 export function number_ticks(pen, first, last, x, y, apart) {
   const left = x(first), right = x(last), every = Math.max(rounded_up(((last - first) * apart) / Math.max(right - left, 1)), 1);
   for (let k = Math.ceil(first / every) * every; k <= last; k += every) {
@@ -43,7 +43,7 @@ export function number_ticks(pen, first, last, x, y, apart) {
   }
 }
 
-/** Calls `to` with each event of a pointer that presses `element` and moves, and with the first of them; `takes` says whether it begins. */
+/** Calls `to` with each event of a pointer that drags on `element`, and with the first event of the drag, which `takes` may refuse. */
 export function dragged(element, to, takes = () => true) {
   let began = null;
   element.addEventListener("pointerdown", (event) => {
