@@ -102,6 +102,20 @@ def test_what_is_unseen_is_known_by_what_came_before(kept: int, every: int) -> N
     assert np.array_equal(unseen_motion(early).sigmas(t), unseen_motion(odometry).sigmas(t))
 
 
+@pytest.mark.parametrize("jitter", [0.0, 1e-3])
+def test_that_a_robot_stood_tells_nothing_of_its_motion(jitter: float) -> None:
+    poses, stood = driven(1, 100.0), 3000
+    noise = np.random.default_rng(1).normal(0.0, jitter, (stood, 3))
+    after = logged(np.concatenate((poses[0] + noise, poses)), 50)
+    t = after.t0[stood // 50 + 4 :] + 2.0
+    found, alone = (
+        unseen_motion(after).sigmas(t),
+        unseen_motion(logged(poses, 50)).sigmas(t - stood * PERIOD_S),
+    )
+    assert np.all(found > 0.7 * alone)
+    assert np.max(unseen_motion(after).sigmas(after.t0[8 : stood // 50] + 2.0)) <= 10.0 * jitter
+
+
 def test_a_pose_of_the_log_is_known() -> None:
     odometry = logged(driven(1, 60.0), 50)
     known = unseen_motion(odometry)

@@ -7,13 +7,16 @@ from typing import NamedTuple
 import numpy as np
 
 from compose.recording.ranging.range_recording import SAME_TIME_S, Numbers, RobotOdometry
-from compose.recording.ranging.range_steps import dead_reckoned, over_of, relative, within
+from compose.recording.ranging.range_steps import Flags, dead_reckoned, over_of, relative, within
 
 FEWEST_WINDOWS = 3
 """The number of windows from which on they tell how far a robot is from its arcs."""
 
 UNKNOWN, UNKNOWN_TURN = 0.25, 0.5
 """The sigmas with fewer windows: of a position, relative to the increment's way; of a heading in rad."""
+
+MOVING, TURNING = 0.01, 0.02
+"""The speed (m/s) and turn rate (rad/s) from which on a robot moves. Windows at rest say nothing of it."""
 
 LONGEST_S = 64.0
 """The length in s of the longest windows: over longer increments, there are no estimates."""
@@ -36,8 +39,11 @@ class UnseenMotion(NamedTuple):
     """
 
     odometry: RobotOdometry
-    windows: dict[float, Deviations]
-    """The deviations by the length of the windows in s: a power of 2, at least that of two increments."""
+    windows: dict[tuple[float, bool], Deviations]
+    """The deviations in windows of a length in s, a power of 2 and at least that of two increments.
+
+    They are of all windows, and, if True, of those in which the robot moved.
+    """
 
     def sigmas(self, t: Numbers) -> Numbers:
         """Return the sigmas along each axis (m) and of the heading (rad) at times in s; shape (N, 2).
@@ -49,10 +55,10 @@ class UnseenMotion(NamedTuple):
         lasts, over = (self.odometry.t1 - self.odometry.t0)[row], over_of(self.odometry, row, t)
         way = np.hypot(*self.odometry.increments[row, :2].T)
         found: Numbers = np.stack((UNKNOWN * way, np.full(len(t), UNKNOWN_TURN)), axis=1)
-        lengths = window_lengths(lasts)
-        for length, known in self.windows.items():
+        lengths, moves = window_lengths(lasts), _moves(self.odometry.increments[row], lasts)
+        for (length, moved), known in self.windows.items():
             place = np.searchsorted(known.ends, t, side="right") - 1
-            told = (lengths == length) & (place >= FEWEST_WINDOWS - 1)
+            told = (lengths == length) & (moves == moved) & (place >= FEWEST_WINDOWS - 1)
             found[told] = known.so_far[place[told]] * np.sqrt(lasts[told] / length)[:, None]
         return found * np.sqrt(4.0 * over * (1.0 - over))[:, None]
 
@@ -65,21 +71,38 @@ def window_lengths(lasts: Numbers) -> Numbers:
 def unseen_motion(odometry: RobotOdometry) -> UnseenMotion:
     """Return the deviations of a robot's motion from arcs, by its odometry without gaps."""
     lengths = np.unique(window_lengths(odometry.t1 - odometry.t0)).tolist()
-    return UnseenMotion(odometry, {one: _deviations(odometry, one) for one in lengths if one <= LONGEST_S})
+    windows: dict[tuple[float, bool], Deviations] = {}
+    for length in lengths:
+        if length <= LONGEST_S:
+            windows[length, False], windows[length, True] = _deviations(odometry, length)
+    return UnseenMotion(odometry, windows)
 
 
-def _deviations(odometry: RobotOdometry, length: float) -> Deviations:
-    """Return the deviations in windows of so many seconds, none of whose increments is longer than half."""
-    first = np.flatnonzero(odometry.t0 + length <= odometry.t1[-1] + SAME_TIME_S)
-    begin = odometry.t0[first]
-    past = np.searchsorted(odometry.t0, begin + length - SAME_TIME_S)
-    lasts = np.append(odometry.t1 - odometry.t0, 0.0)
-    longest = np.maximum.reduceat(lasts, np.stack((first, past), axis=1).ravel())[::2]
-    begin = begin[longest <= 0.5 * length + SAME_TIME_S]
-    if not len(begin):
-        return Deviations(np.zeros(0), np.zeros((0, 2)))
-    poses = [dead_reckoned(odometry, begin + part * length) for part in (0.0, 0.5, 1.0)]
-    arc = within(relative(poses[0], poses[2]), np.full(len(begin), 0.5))
-    x, y, heading = np.square(relative(poses[0], poses[1]) - arc).T
-    sums = np.cumsum(np.stack((0.5 * (x + y), heading), axis=1), axis=0)
-    return Deviations(begin + length, np.sqrt(sums / np.arange(1, len(begin) + 1)[:, None]))
+def _moves(motion: Numbers, lasts: Numbers | float) -> Flags:
+    """Return whether a robot moves, by each `motion` and the time in s that it `lasts`; shape (N,)."""
+    moves: Flags = np.hypot(*motion[:, :2].T) > MOVING * lasts
+    return moves | (np.abs(motion[:, 2]) > TURNING * lasts)
+
+
+def _deviations(odometry: RobotOdometry, length: float) -> tuple[Deviations, Deviations]:
+    """Return the deviations in all windows of so many seconds, and in those in which the robot moved.
+
+    No increment of a window is longer than half of it. A window counts from half of MOVING and TURNING on, so
+    that no arc is too slow for windows that is fast enough for increments.
+    """
+    begin = odometry.t0[odometry.t0 + length <= odometry.t1[-1] + SAME_TIME_S]
+    long = odometry.t1 - odometry.t0 > 0.5 * length + SAME_TIME_S
+    before = np.concatenate(([0], np.cumsum(long)))
+    first, past = (np.searchsorted(odometry.t0, begin + off) for off in (0.0, length - SAME_TIME_S))
+    begin = begin[before[first] == before[past]]
+    start, middle, end = [dead_reckoned(odometry, begin + part * length) for part in (0.0, 0.5, 1.0)]
+    half, whole = relative(start, middle), relative(start, end)
+    x, y, heading = np.square(half - within(whole, np.full(len(begin), 0.5))).T
+    squares, ends = np.stack((0.5 * (x + y), heading), axis=1), begin + length
+    moved = _moves(half, 0.25 * length) | _moves(whole, 0.5 * length)
+    return _so_far(ends, squares), _so_far(ends[moved], squares[moved])
+
+
+def _so_far(ends: Numbers, squares: Numbers) -> Deviations:
+    """Return the deviations whose `squares` are of windows that end at `ends`."""
+    return Deviations(ends, np.sqrt(np.cumsum(squares, axis=0) / np.arange(1, len(ends) + 1)[:, None]))
