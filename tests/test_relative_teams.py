@@ -29,6 +29,13 @@ def test_a_claim_has_the_bound_of_its_measurements_and_errors_of_the_world_chang
     assert off.errors != noisy.errors
 
 
+def test_two_robots_claim_while_the_fit_of_a_third_goes_to_and_fro_between_poses() -> None:
+    found = result_of(3, 0.0, 5002, team_tasks.next_task)
+    assert found.outcome == "localised"
+    assert found.ticks < 30
+    assert max(found.errors) < 1e-9
+
+
 @pytest.mark.parametrize("reach", [5.0, 15.0])
 def test_the_share_of_admitted_starts_is_that_of_points_in_the_square(reach: float) -> None:
     first, second = np.random.default_rng(1).uniform(0.0, 10.0, (2, 1000, 2))

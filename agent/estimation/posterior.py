@@ -190,14 +190,16 @@ def ended(found: Posterior, measured: JointMeasurements) -> Posterior:
     """Return the hypotheses with fits that have ended, if the likeliest is FAR_OFF its linear model.
 
     What is off then counts as misfit. The model would explain three ranges of a robot wherever it is: no
-    other robot that has ranges to it could ever claim its pose.
+    other robot that has ranges to it could ever claim its pose. With exact sensors, that is any step above
+    FINISHED: fits go to and fro between two poses that explain the same ranges.
     """
-    if not found.hypotheses or found.hypotheses[0].fit.last_step <= FAR_OFF:
+    far = FINISHED if measured.only_rounding else FAR_OFF
+    if not found.hypotheses or found.hypotheses[0].fit.last_step <= far:
         return found
     part, nu, fitted = measured.some(found.located), measured.noise.sigma_degrees, []
     for one in found.hypotheses:
-        for fit in fits(part, [one.fit.start], PATIENT) if one.fit.last_step > FAR_OFF else [one.fit]:
-            chi2 = fit.chi2 + (fit.last_step**2 * fit.level if fit.last_step > FAR_OFF else 0.0)
+        for fit in fits(part, [one.fit.start], PATIENT) if one.fit.last_step > far else [one.fit]:
+            chi2 = fit.chi2 + (fit.last_step**2 * fit.level if fit.last_step > far else 0.0)
             before, after = [misfit_log_likelihood(each, fit.freedom, nu) for each in (fit.chi2, chi2)]
             fitted.append(fit._replace(chi2=chi2, weight=fit.weight + after - before))
     return Posterior(found.located, hypotheses_of(fitted, part))
