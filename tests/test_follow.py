@@ -12,10 +12,10 @@ from pathlib import Path
 
 import pytest
 from mcap.writer import Writer
-from msgspec.structs import asdict
+from msgspec.structs import asdict, replace
 
 from agent.estimation.following import ClaimRule
-from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR
+from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR, BadRecording
 from compose.recording.estimating import estimate_run
 from compose.recording.estimating.estimate_rows import PoseEstimateRow, estimate_csv
 from compose.recording.estimating.estimate_run import StreamEstimate, estimated
@@ -23,7 +23,15 @@ from compose.recording.estimating.noise_files import told_noise
 from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
-from compose.recording.ranging.range_recording import RangeRecording
+from compose.recording.ranging.range_recording import LONG_GAP_S, RangeRecording
+from compose.recording.ranging.recording_rows import (
+    AnchorRow,
+    AntennaRow,
+    AnyRow,
+    OdometryRow,
+    RangeRow,
+    SourcePlace,
+)
 from protocol.motion import Pose, compose
 from tests.commands import tandem
 from tests.range_tables import SAMPLE, circling
@@ -125,6 +133,31 @@ def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Message
         assert times == sorted(set(times))
         assert len(result.epochs[-1].claims) == 2
         assert times[-1] > end - 0.6
+
+
+@pytest.mark.parametrize("first_end", [3.0, 12.0])
+def test_a_robot_whose_first_increment_ends_late_joins_a_stream_within_10_s(first_end: float) -> None:
+    tables = circling(first_end + 2.0)
+    rows: list[tuple[float, AnyRow]] = [(0.0, AntennaRow("late", 0.0, 0.0, 0.0))]
+    rows += [(0.0, AnchorRow(**one)) for one in tables["anchors"]]  # type: ignore[arg-type]
+    for name in ("r", "late"):
+        for one in tables["ranges"]:
+            row = RangeRow(float(str(one["t"])), name, str(one["to"]), float(str(one["range"])), 0.05)
+            rows.append((row.t, row))
+    for one in tables["odometry"]:
+        increment = OdometryRow(**one)  # type: ignore[arg-type]
+        rows.append((increment.t1, increment))
+        if increment.t0 >= first_end:
+            rows.append((increment.t1, replace(increment, robot="late")))
+    rows.append((first_end, OdometryRow("late", 0.0, first_end, 0.5, 0.0, 0.25 * first_end)))
+    rows.sort(key=lambda one: (one[0], isinstance(one[1], OdometryRow)))
+    estimate = StreamEstimate("it", None, told_noise(PROFILE), ClaimRule())
+    arriving = ((row, SourcePlace("it", i)) for i, (_, row) in enumerate(rows))
+    if first_end > LONG_GAP_S:
+        with pytest.raises(BadRecording, match="late has no odometry"):
+            list(estimate.rows(arriving))
+    else:
+        assert {row.robot for row in estimate.rows(arriving) if row.t_s > first_end} == {"r", "late"}
 
 
 def test_poses_in_a_stream_are_its_odometry(messages: Messages) -> None:

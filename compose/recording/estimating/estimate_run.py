@@ -1,7 +1,8 @@
 """A whole estimate: from measurements to rows and their summary, of a file or as a stream of rows arrives.
 
 In a stream, an epoch is computed as soon as the odometry of all robots has reached its end. Rows must arrive
-in the order of time, as in a file: a range that comes later counts from the next epoch on.
+in the order of time, as in a file: a range that comes later counts from the next epoch on. A range of a robot
+without odometry waits for its first increment, for at most LONG_GAP_S.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from compose.recording.estimating.recorded_measurements import (
     numerics,
 )
 from compose.recording.estimating.recording_estimator import EstimateEpoch, RecordingEstimator
-from compose.recording.ranging.range_recording import SAME_TIME_S
+from compose.recording.ranging.range_recording import LONG_GAP_S, SAME_TIME_S
 from compose.recording.ranging.range_steps import NoSteps
 from compose.recording.ranging.recording_builder import RecordingBuilder
 from compose.recording.ranging.recording_rows import AnyRow, OdometryRow, PoseRow, SourcePlace
@@ -125,9 +126,10 @@ class StreamEstimate:
         self._due_after_s = lasts + EPOCH_S  # if there is none, it is not tried with each row
         examined = lasts >= self._examined_after_s
         doubt = None if examined else self._doubt
+        complete_s = min(end for _, end in spans.values()) - LONG_GAP_S
         try:
             measured = measurements(
-                *(self._builder.recording(), names, self._noise),
+                *(self._builder.recording(complete_s), names, self._noise),
                 relative=self._relative,
                 ticks=STREAM_TICKS,
                 doubt=doubt,

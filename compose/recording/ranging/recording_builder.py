@@ -198,13 +198,18 @@ class RecordingBuilder:
         self._last_range[pair] = row.t
         self._ranges.append((row, place))
 
-    def recording(self) -> RangeRecording:
-        """Return the recording. Raises BadRecording if a name is unknown, or if there is no odometry."""
+    def recording(self, through_s: float = math.inf) -> RangeRecording:
+        """Return the recording. Raises BadRecording if a name is unknown, or if there is no odometry.
+
+        Ranges after `through_s` are left out if they name a robot whose first increment may be still to come,
+        and if no odometry begins by then, other rows may name one, too.
+        """
         if not self._odometry:
             there = ", ".join([f"{what}: {count}" for what, count in self.unused.items()])
             hint = f", but {there}; a .toml file maps topics of ROS" if there else ""
             raise BadRecording(f"{self.source}: there is no odometry{hint}")
-        for robot, place in self._claims:
+        begun = any(begin <= through_s for begin, _ in self.spans.values())
+        for robot, place in self._claims if begun or through_s == math.inf else ():
             if robot not in self._odometry:
                 raise BadRecording(f"{place}: robot: {robot} has no odometry")
         anchors = self._anchors | self._given
@@ -215,7 +220,7 @@ class RecordingBuilder:
             self.source,
             tuple(map(self._robot, self._odometry)),
             tuple([one.fixed for one in anchors.values()]),
-            self._range_series([*self._odometry, *anchors]),
+            self._range_series([*self._odometry, *anchors], through_s),
             dict(self.unused),
         )
         self._check_times(recording)
@@ -269,11 +274,16 @@ class RecordingBuilder:
         there = f"robots: {robots}; anchors: {anchors or 'none'}"
         return f"is neither a robot with odometry nor a known anchor; {there}{did_you_mean(name, names)}"
 
-    def _range_series(self, names: Sequence[str]) -> RangeSeries:
+    def _range_series(self, names: Sequence[str], through_s: float) -> RangeSeries:
         radios = {name: i for i, name in enumerate(names)}
         robots = len(self._odometry)
-        ends = np.empty((len(self._ranges), 2), np.intp)
-        for i, (row, place) in enumerate(self._ranges):
+        used = [
+            (row, place)
+            for row, place in self._ranges
+            if row.t <= through_s or (row.first in radios and row.second in radios)
+        ]
+        ends = np.empty((len(used), 2), np.intp)
+        for i, (row, place) in enumerate(used):
             for name in (row.first, row.second):
                 if name not in radios:
                     raise BadRecording(f"{place}: {name} {self._unknown(name, names)}")
@@ -282,7 +292,7 @@ class RecordingBuilder:
                 raise BadRecording(f"{place}: {row.first} and {row.second} are both anchors")
             if ends[i, 0] >= robots:
                 ends[i] = ends[i, ::-1]
-        lengths = [(row.t, row.range, np.nan if row.sigma is None else row.sigma) for row, _ in self._ranges]
+        lengths = [(row.t, row.range, np.nan if row.sigma is None else row.sigma) for row, _ in used]
         t, measured, sigma = _table(lengths, 3).T
         unsorted = RangeSeries(t, ends[:, 0], ends[:, 1], measured, sigma)
         return unsorted.rows(np.argsort(t, kind="stable"))
