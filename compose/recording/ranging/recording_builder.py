@@ -201,8 +201,8 @@ class RecordingBuilder:
     def recording(self, through_s: float = math.inf) -> RangeRecording:
         """Return the recording. Raises BadRecording if a name is unknown, or if there is no odometry.
 
-        Ranges after `through_s` are left out if they name a robot whose first increment may be still to come,
-        and if no odometry begins by then, other rows may name one, too.
+        Ranges after `through_s` that name a robot without odometry are left out: its first increment may come
+        later. If no odometry begins by `through_s`, other rows may name such a robot, too.
         """
         if not self._odometry:
             there = ", ".join([f"{what}: {count}" for what, count in self.unused.items()])

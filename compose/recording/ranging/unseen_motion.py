@@ -40,9 +40,9 @@ class UnseenMotion(NamedTuple):
 
     odometry: RobotOdometry
     windows: dict[tuple[float, bool], Deviations]
-    """The deviations in windows of a length in s, a power of 2 and at least that of two increments.
+    """The deviations by the length of the windows, and whether only those count in which the robot moved.
 
-    They are of all windows, and, if True, of those in which the robot moved.
+    The length in s is a power of 2, and at least that of two increments.
     """
 
     def sigmas(self, t: Numbers) -> Numbers:
@@ -54,13 +54,13 @@ class UnseenMotion(NamedTuple):
         row = np.maximum(np.searchsorted(self.odometry.t0, t, side="right") - 1, 0)
         lasts, over = (self.odometry.t1 - self.odometry.t0)[row], over_of(self.odometry, row, t)
         way = np.hypot(*self.odometry.increments[row, :2].T)
-        found: Numbers = np.stack((UNKNOWN * way, np.full(len(t), UNKNOWN_TURN)), axis=1)
+        sigmas: Numbers = np.stack((UNKNOWN * way, np.full(len(t), UNKNOWN_TURN)), axis=1)
         lengths, moves = window_lengths(lasts), _moves(self.odometry.increments[row], lasts)
-        for (length, moved), known in self.windows.items():
-            place = np.searchsorted(known.ends, t, side="right") - 1
-            told = (lengths == length) & (moves == moved) & (place >= FEWEST_WINDOWS - 1)
-            found[told] = known.so_far[place[told]] * np.sqrt(lasts[told] / length)[:, None]
-        return found * np.sqrt(4.0 * over * (1.0 - over))[:, None]
+        for (length, moved), deviations in self.windows.items():
+            latest = np.searchsorted(deviations.ends, t, side="right") - 1
+            rows = (lengths == length) & (moves == moved) & (latest >= FEWEST_WINDOWS - 1)
+            sigmas[rows] = deviations.so_far[latest[rows]] * np.sqrt(lasts[rows] / length)[:, None]
+        return sigmas * np.sqrt(4.0 * over * (1.0 - over))[:, None]
 
 
 def window_lengths(lasts: Numbers) -> Numbers:
@@ -87,8 +87,8 @@ def _moves(motion: Numbers, lasts: Numbers | float) -> Flags:
 def _deviations(odometry: RobotOdometry, length: float) -> tuple[Deviations, Deviations]:
     """Return the deviations in all windows of so many seconds, and in those in which the robot moved.
 
-    No increment of a window is longer than half of it. A window counts from half of MOVING and TURNING on, so
-    that no arc is too slow for windows that is fast enough for increments.
+    No increment of a window is longer than half of it. The robot moved in a window from half of MOVING and
+    TURNING on: what counts as motion in an increment then does so in a window.
     """
     begin = odometry.t0[odometry.t0 + length <= odometry.t1[-1] + SAME_TIME_S]
     long = odometry.t1 - odometry.t0 > 0.5 * length + SAME_TIME_S
