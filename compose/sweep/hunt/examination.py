@@ -23,9 +23,9 @@ from protocol.wire import EncodedMessages
 from world.scenario import Scenario
 
 MOST_TICKS = 120_000
-"""The largest `max_ticks` of a mission that must localise its robots, times their number, that is run."""
+"""The largest product of `max_ticks` and robots of a mission that must localise them; others are refused."""
 MOST_WITHOUT_END = 750
-"""The number of ticks of a mission that need not localise its robots, at most, which are examined.
+"""The largest number of ticks that are examined of a mission that need not localise its robots.
 
 A robot that waits for what was lost waits until `max_ticks`, and each restart would replay all of it.
 """

@@ -37,8 +37,8 @@ class Breach(msgspec.Struct, frozen=True):
 def breaches(run: Run, *, replayed: bool) -> Iterator[Breach]:
     """Yield the invariants that do not hold in `run`, the rules of the audit included.
 
-    `replayed` is whether a second run of the same input has given the same bytes. The rule `decision` would
-    then show nothing new. The rule `order` would report that the journals of a run that is cut break off.
+    `replayed` leaves out the rule `decision`: a second run of the same input has given the same bytes, or is
+    spared. The rule `order` would report that the journals of a run that is cut break off.
     """
     applied = list(rules.AUDIT_RULES)
     if replayed:
