@@ -27,7 +27,7 @@ from compose.recording.ranging.unseen_motion import UnseenMotion, unseen_motion
 from docs.recorded_windows import is_wrong
 from protocol.motion import Pose, step, wrap
 
-PERIOD_S, SIGMA = 0.1, 0.05
+PERIOD_S, SIGMA, RESTING = 0.1, 0.05, 0.01
 PLACES = [(0.0, 0.0), (8.0, 0.3), (7.6, 8.0), (0.2, 7.7)]
 
 
@@ -79,7 +79,7 @@ def test_the_motion_between_poses_deviates_as_the_odometry_says(every: int) -> N
     arc = within(odometry.increments, np.full(len(t), 0.5))
     off = relative(poses[:-1:every], middle) - arc
     x, y, heading = np.sqrt(np.mean(np.square(off), axis=0)).tolist()
-    along, turn = unseen_motion(odometry).sigmas(t)[-1].tolist()
+    along, turn = unseen_motion(odometry, RESTING).sigmas(t)[-1].tolist()
     assert 0.8 < along / math.hypot(x, y) * math.sqrt(2.0) < 3.0
     assert 0.8 < turn / heading < 3.0
 
@@ -91,7 +91,7 @@ def test_where_a_robot_drives_one_arc_nothing_is_unseen(v: float, omega: float, 
     end = step(Pose(0.0, 0.0, 0.0), v, omega, PERIOD_S * ticks)
     moved = np.tile((end.x, end.y, omega * PERIOD_S * ticks), (29, 1))
     odometry = RobotOdometry(t[:-1], t[1:], moved, np.zeros((29, 3, 3)))
-    assert np.all(unseen_motion(odometry).sigmas(np.linspace(t[8], t[-1], 100)) < 1e-6)
+    assert np.all(unseen_motion(odometry, RESTING).sigmas(np.linspace(t[8], t[-1], 100)) < 1e-6)
 
 
 @given(st.integers(3, 60), st.sampled_from([1, 7, 20]))
@@ -99,7 +99,7 @@ def test_what_is_unseen_is_known_by_what_came_before(kept: int, every: int) -> N
     odometry = logged(driven(1, 120.0), every)
     early = RobotOdometry(*[column[:kept] for column in odometry])
     t = np.linspace(0.0, early.t1[-1], 50)[:-1]
-    assert np.array_equal(unseen_motion(early).sigmas(t), unseen_motion(odometry).sigmas(t))
+    assert np.array_equal(unseen_motion(early, RESTING).sigmas(t), unseen_motion(odometry, RESTING).sigmas(t))
 
 
 @pytest.mark.parametrize("jitter", [0.0, 1e-3])
@@ -109,16 +109,16 @@ def test_that_a_robot_stood_tells_nothing_of_its_motion(jitter: float) -> None:
     after = logged(np.concatenate((poses[0] + noise, poses)), 50)
     t = after.t0[stood // 50 + 4 :] + 2.0
     found, alone = (
-        unseen_motion(after).sigmas(t),
-        unseen_motion(logged(poses, 50)).sigmas(t - stood * PERIOD_S),
+        unseen_motion(after, RESTING).sigmas(t),
+        unseen_motion(logged(poses, 50), RESTING).sigmas(t - stood * PERIOD_S),
     )
     assert np.all(found > 0.7 * alone)
-    assert np.max(unseen_motion(after).sigmas(after.t0[8 : stood // 50] + 2.0)) <= 10.0 * jitter
+    assert np.max(unseen_motion(after, RESTING).sigmas(after.t0[8 : stood // 50] + 2.0)) <= 10.0 * jitter
 
 
 def test_a_pose_of_the_log_is_known() -> None:
     odometry = logged(driven(1, 60.0), 50)
-    known = unseen_motion(odometry)
+    known = unseen_motion(odometry, RESTING)
     assert np.all(known.sigmas(np.append(odometry.t0, odometry.t1)) == 0.0)
     assert np.all(known.sigmas(odometry.t0 + 1.0) > 0.1)
 

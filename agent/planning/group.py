@@ -81,6 +81,10 @@ class GroupPlanner(Planner[RobotState, Report]):
             return state
         return state.with_agenda(unmet=unmet, lingering=lingering)
 
+    def report(self, state: RobotState) -> Report:
+        """Return the report to the peer of the present meeting."""
+        return self.pair_planner.report(state)
+
     def report_to(self, state: RobotState, peer: str) -> Report:
         """Return the report to `peer`: the log, or outside a meeting what others need to know.
 
@@ -93,7 +97,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         if appointments.refused(state, peer):
             report = exchange.report_without_log(state, state.agenda.failure)
         elif peer == state.config.peer and (state.meets or searching.has_beacon(state)):
-            return self.pair_planner.report(state)
+            return self.report(state)
         else:
             report = searching.outside_meeting(state, peer)
         unconfirmed = state.config.confirms and state.agenda.fix is not None and report.verdict is None

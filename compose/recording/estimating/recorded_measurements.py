@@ -23,7 +23,7 @@ from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from compose.errors import BadRecording, NoEstimate, UserError
 from compose.recording.estimating.doubtful_units import doubtful_units
 from compose.recording.estimating.noise_files import AssumedNoise, stated_noise, told_noise
-from compose.recording.estimating.sound_odometry import SoundOdometry, at_antenna, levelled, sound
+from compose.recording.estimating.sound_odometry import FLOOR_S, SoundOdometry, at_antenna, levelled, sound
 from compose.recording.estimating.true_poses import in_frame_of, with_bridged_truth
 from compose.recording.ranging.range_recording import (
     SAME_TIME_S,
@@ -265,7 +265,7 @@ def _measurements(
     lasts = np.median(np.concatenate([one.odometry.t1 - one.odometry.t0 for one in part.robots]))
     noise = assumed.of_fit(float(lasts) / period)
     anchors = [used.anchors_of(i)[:MOST_USED_ANCHORS] for i in range(len(names))]
-    unseen = [unseen_motion(robot.odometry) for robot in part.robots]
+    unseen = [unseen_motion(robot.odometry, assumed.sigma / FLOOR_S) for robot in part.robots]
     ranges = list(_ranges(used, steps, assumed, anchors, unseen))
     placed = {one.id: one for own in anchors for one in own}.values()
     places = {

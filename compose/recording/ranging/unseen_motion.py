@@ -15,8 +15,8 @@ FEWEST_WINDOWS = 3
 UNKNOWN, UNKNOWN_TURN = 0.25, 0.5
 """The sigmas with fewer windows: of a position, relative to the increment's way; of a heading in rad."""
 
-MOVING, TURNING = 0.01, 0.02
-"""The speed (m/s) and turn rate (rad/s) from which on a robot moves. Windows at rest say nothing of it."""
+TURNING = 0.02
+"""The turn rate (rad/s) from which on a robot moves."""
 
 LONGEST_S = 64.0
 """The length in s of the longest windows: over longer increments, there are no estimates."""
@@ -44,6 +44,8 @@ class UnseenMotion(NamedTuple):
 
     The length in s is a power of 2, and at least that of two increments.
     """
+    resting: float
+    """The speed (m/s) below which a robot rests that hardly turns: then it says nothing of its motion."""
 
     def sigmas(self, t: Numbers) -> Numbers:
         """Return the sigmas along each axis (m) and of the heading (rad) at times in s; shape (N, 2).
@@ -55,7 +57,7 @@ class UnseenMotion(NamedTuple):
         lasts, over = (self.odometry.t1 - self.odometry.t0)[row], over_of(self.odometry, row, t)
         way = np.hypot(*self.odometry.increments[row, :2].T)
         sigmas: Numbers = np.stack((UNKNOWN * way, np.full(len(t), UNKNOWN_TURN)), axis=1)
-        lengths, moves = window_lengths(lasts), _moves(self.odometry.increments[row], lasts)
+        lengths, moves = window_lengths(lasts), _moves(self.odometry.increments[row], lasts, self.resting)
         for (length, moved), deviations in self.windows.items():
             latest = np.searchsorted(deviations.ends, t, side="right") - 1
             rows = (lengths == length) & (moves == moved) & (latest >= FEWEST_WINDOWS - 1)
@@ -68,27 +70,30 @@ def window_lengths(lasts: Numbers) -> Numbers:
     return np.asarray(2.0 ** np.ceil(np.log2(2.0 * np.maximum(lasts, SAME_TIME_S))), np.float64)
 
 
-def unseen_motion(odometry: RobotOdometry) -> UnseenMotion:
-    """Return the deviations of a robot's motion from arcs, by its odometry without gaps."""
+def unseen_motion(odometry: RobotOdometry, resting: float) -> UnseenMotion:
+    """Return the deviations of a robot's motion from arcs, by its odometry without gaps.
+
+    `resting` is the speed (m/s) below which it rests.
+    """
     lengths = np.unique(window_lengths(odometry.t1 - odometry.t0)).tolist()
     windows: dict[tuple[float, bool], Deviations] = {}
     for length in lengths:
         if length <= LONGEST_S:
-            windows[length, False], windows[length, True] = _deviations(odometry, length)
-    return UnseenMotion(odometry, windows)
+            windows[length, False], windows[length, True] = _deviations(odometry, length, resting)
+    return UnseenMotion(odometry, windows, resting)
 
 
-def _moves(motion: Numbers, lasts: Numbers | float) -> Flags:
+def _moves(motion: Numbers, lasts: Numbers | float, resting: float) -> Flags:
     """Return whether a robot moves, by each `motion` and the time in s that it `lasts`; shape (N,)."""
-    moves: Flags = np.hypot(*motion[:, :2].T) > MOVING * lasts
+    moves: Flags = np.hypot(*motion[:, :2].T) > resting * lasts
     return moves | (np.abs(motion[:, 2]) > TURNING * lasts)
 
 
-def _deviations(odometry: RobotOdometry, length: float) -> tuple[Deviations, Deviations]:
+def _deviations(odometry: RobotOdometry, length: float, resting: float) -> tuple[Deviations, Deviations]:
     """Return the deviations in all windows of so many seconds, and in those in which the robot moved.
 
-    No increment of a window is longer than half of it. The robot moved in a window from half of MOVING and
-    TURNING on: what counts as motion in an increment then does so in a window.
+    No increment of a window is longer than half of it. The robot moved in a window from half of `resting`
+    and TURNING on: what counts as motion in an increment then does so in a window.
     """
     begin = odometry.t0[odometry.t0 + length <= odometry.t1[-1] + SAME_TIME_S]
     long = odometry.t1 - odometry.t0 > 0.5 * length + SAME_TIME_S
@@ -99,7 +104,7 @@ def _deviations(odometry: RobotOdometry, length: float) -> tuple[Deviations, Dev
     half, whole = relative(start, middle), relative(start, end)
     x, y, heading = np.square(half - within(whole, np.full(len(begin), 0.5))).T
     squares, ends = np.stack((0.5 * (x + y), heading), axis=1), begin + length
-    moved = _moves(half, 0.25 * length) | _moves(whole, 0.5 * length)
+    moved = _moves(half, 0.25 * length, resting) | _moves(whole, 0.5 * length, resting)
     return _so_far(ends, squares), _so_far(ends[moved], squares[moved])
 
 
