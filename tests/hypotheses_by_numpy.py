@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from agent.estimation.elementary import cos, hypot, product, quadratic, sin, solve
+from agent.estimation.elementary import cos, dot, hypot, product, quadratic, sin, solve
 from agent.estimation.fit import Fit, deviation
 from agent.estimation.gaussian.anchor_guesses import (
     MOST_GUESSES,
@@ -29,10 +29,12 @@ from agent.estimation.gaussian.placement_guesses import (
     FINER_TURN,
     HEADING_DAMPING,
     MERGED_WITHIN,
+    OFFSETS,
     RIDGE_BETWEEN,
     SCAN,
     STARTS,
     TURN,
+    WIDE,
     Encounter,
 )
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
@@ -147,24 +149,33 @@ def _best(points: Array, likely: Array, near: float) -> Array:
     return points[chosen]
 
 
-def _scanned(near: Encounter, far: Encounter, i: int, rho: float, apart: tuple[float, float]) -> Array:
+def _scanned(
+    near: Encounter, far: Encounter, i: int, rho: float, apart: tuple[float, float], lever: Array
+) -> Array:
     """Return the candidates from the mutual range `rho` (m) with index `i`; shape (n, 8).
 
     The columns are the rotations of the near and of the far robot, and the whitened offset of each.
     """
-    radius = max(math.hypot(far.x[i], far.y[i]), SIGMA_FLOOR)
-    turn = np.linspace(-math.pi, math.pi, SCAN, endpoint=False)
+    own = max(math.hypot(far.x[i], far.y[i]), SIGMA_FLOOR)
+    outwards = product(np.array(((far.x[i], far.y[i], 0.0),)) / own, far.root)[0]
+    uncertainty = math.sqrt(dot(outwards, outwards))
+    offsets = OFFSETS if uncertainty > WIDE * math.tau / SCAN * lever[0] else OFFSETS[:1]
+    turn = np.linspace(-math.pi, math.pi, SCAN if len(offsets) == 1 else SCAN // 2, endpoint=False)
     c, s = cos(turn), sin(turn)
     x = apart[0] + c * near.x[i] - s * near.y[i]
     y = apart[1] + s * near.x[i] + c * near.y[i]
     gap = np.maximum(hypot(x, y), SIGMA_FLOOR)
     bearing = ARCTAN2(y, x) - math.atan2(far.y[i], far.x[i])
-    opening = ARCCOS(np.clip((gap**2 + radius**2 - rho**2) / (2.0 * gap * radius), -1.0, 1.0))
     candidates = []
-    for way in (1.0, -1.0):
-        z = np.zeros((len(turn), 8))
-        z[:, 0], z[:, 1] = turn, bearing + way * opening
-        candidates.append(z)
+    for offset in offsets:
+        radius = max(own + offset * uncertainty, SIGMA_FLOOR)
+        opening = ARCCOS(np.clip((gap**2 + radius**2 - rho**2) / (2.0 * gap * radius), -1.0, 1.0))
+        for way in (1.0, -1.0):
+            z = np.zeros((len(turn), 8))
+            z[:, 0], z[:, 1] = turn, bearing + way * opening
+            if offset:
+                z[:, 5:8] = offset * outwards / uncertainty
+            candidates.append(z)
     return np.concatenate(candidates)
 
 
@@ -179,7 +190,7 @@ def turned_by_numpy(
 ) -> Array:
     """Return the likeliest rotations and offsets, with their log-likelihoods; see `placement_guesses`."""
     ends = sorted({0, len(rho) - 1})
-    z = np.concatenate([_scanned(robots[0], robots[1], i, float(rho[i]), apart) for i in ends])
+    z = np.concatenate([_scanned(robots[0], robots[1], i, float(rho[i]), apart, lever) for i in ends])
     residuals_at = partial(_residuals_at, robots=robots, middle=middle, rho=rho, apart=apart)
     coarse = 3.0 * math.tau / SCAN * float(lever[0])
     finest = float(np.min(sigma))
