@@ -53,10 +53,10 @@ actuation = {v = 0.05, omega = 0.05}"""
 """Noise with which one of sixteen robots a meets b, and cannot claim after 60 mutual ranges."""
 UNSETTLED = (
     411770278714326748,
-    4578615535636952543,
-    7278109122492486642,
+    5187163166335705732,
+    2541256914490685401,
 )
-"""Seeds of WHEELS, among the first that were drawn, in which a leaves b after a meeting."""
+"""Seeds of WHEELS, three of the first that were drawn, in which a leaves b after a meeting."""
 PASSED = 49
 """The number of ticks of T_max in these missions."""
 
