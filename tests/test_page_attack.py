@@ -106,7 +106,7 @@ def test_without_the_ground_truth_nothing_is_known_to_be_false(recording: Path, 
 
 
 def test_what_an_attack_cost_arrives_with_the_scene_that_tells_it(recording: Path) -> None:
-    """Without the scene, the page would show none until it had fetched it."""
+    """The update that the server sends has both: without the scene, the page shows none until it asks."""
 
     async def told() -> dict[str, Any]:
         site = of_folder(recording)

@@ -51,7 +51,8 @@ A fit moves by itself along directions that the ranges leave undetermined.
 OFFSETS = (0.0, 1.0, -1.0, 2.0, -2.0)
 """The offsets of the far robot from its anchor's circle that are scanned, in sigmas of its radius.
 
-With 0 alone, sweeps have the same results, and half as many of those pairs again are missed (`Encounter`).
+With 0 alone, sweeps have the same results, but of two robots with noise and 90 % of reports damaged
+(tests/test_faults.py), one stays undecided for 3 000 ticks.
 """
 
 WIDE = 0.25

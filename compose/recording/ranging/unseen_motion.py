@@ -13,7 +13,10 @@ FEWEST_WINDOWS = 3
 """The number of windows from which on they tell how far a robot is from its arcs."""
 
 UNKNOWN, UNKNOWN_TURN = 0.25, 0.5
-"""The sigmas with fewer windows: of a position, relative to the increment's way; of a heading in rad."""
+"""The sigmas with fewer windows: of a position, relative to the increment's way; of a heading in rad.
+
+They are guesses, which hold at the begin of a recording only.
+"""
 
 TURNING = 0.02
 """The turn rate (rad/s) from which on a robot moves."""
