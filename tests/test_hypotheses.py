@@ -29,6 +29,7 @@ from agent.estimation.gaussian.joint_ranges import (
     MOST_CORRELATED_RANGES,
     MOST_MUTUAL_RANGES,
     MOST_RANGES_BY_EXACT_ODOMETRY,
+    MOVED,
     JointMeasurements,
     Silence,
 )
@@ -450,6 +451,27 @@ def test_what_is_left_of_old_ranges_seldom_changes() -> None:
     assert sum(not before <= after for before, after in pairwise(old)) <= 5, (
         "as often as their number doubles"
     )
+
+
+def driving(steps: Sequence[float]) -> JointMeasurements:
+    """Return the measurements of a robot that drives straight on by `steps` (m), and of one that stands."""
+    ranges, own = [(tick, 1.0) for tick in range(len(steps))], np.array(steps)
+    paths = track(own, np.zeros(len(own)), 1.0), track(np.zeros(len(own)), np.zeros(len(own)), 1.0)
+    return near_anchors(paths, ([], []), ((0.0, 0.0), APART), GYRO, REACH, ranges)
+
+
+def test_ranges_at_rest_do_not_replace_those_from_other_places() -> None:
+    places = MOST_CORRELATED_RANGES // 2
+    rested = driving([0.1 * REACH] * places + [0.0] * 1000)
+    assert rested.thinned(REACH).ranges.tick[:places].tolist() == list(range(places))
+
+
+@pytest.mark.parametrize("slower", [0.3, 1.1])
+def test_slow_motion_adds_up_to_another_place(slower: float) -> None:
+    slow = replace(driving([slower * MOVED * REACH] * 40), reach=REACH)
+    assert slow.mutual_places.tolist() == list(range(0, 40, math.ceil(1.0 / slower)))
+    to_and_fro = driving([0.3 * MOVED * REACH, -0.3 * MOVED * REACH] * 20)
+    assert replace(to_and_fro, reach=REACH).mutual_places.tolist() == [0]
 
 
 def test_where_ranges_are_fine_the_truth_is_as_near_as_the_covariance_says() -> None:

@@ -314,8 +314,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     def thinned_after(self, tick: int = -1, most: int | None = None) -> JointMeasurements:
         """Return all ranges up to `tick`, and at most `most` of each pair of radios after it.
 
-        Which of the older ones are left changes only when their number doubles. Of many pairs of robots,
-        fewer are left (see MOST_MUTUAL_RANGES).
+        Of ranges at one place, fewer are left first. Which of the older ones are left changes only when their
+        number doubles. Of many pairs of robots, fewer are left (see MOST_MUTUAL_RANGES).
         """
         ranges, pairs = self.ranges, len(self.ranges.radios)
         if most is None:
@@ -331,17 +331,47 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
             before = int(np.count_nonzero(ranges.tick[rows] <= tick))
             bound = of_pair if both_drive else most
             left[rows[:before]] = True
-            left[rows[before + _recent(len(rows) - before, bound)]] = True
+            left[self._weighed(rows[before:], bound)] = True
         return self if left.all() else msgspec.structs.replace(self, ranges=ranges.rows(left))
 
+    def _weighed(self, rows: Places, most: int) -> Places:
+        """Return at most `most` of the `rows` of one pair of radios: fewer of each place before fewer places.
+
+        A place is a part of the ways of both ends that is as long as MOVED says.
+        """
+        if len(rows) <= most:
+            return rows
+        ends = int(self.ranges.first[rows[0]]), int(self.ranges.second[rows[0]])
+        way = self._positions(ends, self.ranges.tick[rows])
+        parts = np.cumsum(_longest(np.diff(way))) // (MOVED * self.reach)
+        begins = np.append(0, 1 + np.flatnonzero(np.diff(parts, prepend=0.0)))
+        counts, of_place = np.diff(begins, append=len(rows)), most
+        while of_place > 1 and np.minimum(counts, of_place).sum() > most:
+            of_place //= 2
+        of_each = [begin + _recent(count, of_place) for begin, count in zip(begins, counts, strict=True)]
+        weighed: Places = rows[np.concatenate(of_each)]
+        return weighed[_recent(len(weighed), most)]
+
+    def _positions(self, ends: tuple[int, int], ticks: Places) -> Array:
+        """Return the x and y of those of both `ends` that drive at the `ticks`: shape (ends, 2, ticks)."""
+        paths = [self.paths[end] for end in ends if end >= 0 and not self.is_anchor(end)]
+        return np.array([(path.x[ticks], path.y[ticks]) for path in paths])
+
     def from_places(self, ends: tuple[int, int], ticks: Places) -> Places:
-        """Return the indices of `ticks` that are the first, or follow a motion of one of both `ends`."""
-        moved = np.zeros(len(ticks), bool)
-        moved[:1] = True
-        for end in ends:
-            if end >= 0 and not self.is_anchor(end):
-                x, y = self.paths[end].x[ticks], self.paths[end].y[ticks]
-                moved[1:] |= hypot(np.diff(x), np.diff(y)) > MOVED * self.reach
+        """Return the indices of `ticks` that are the first, or when one of both `ends` has moved since.
+
+        It has moved if it is further than MOVED says from where it was at the last one of them.
+        """
+        if not len(ticks):
+            return ticks
+        way, near = self._positions(ends, ticks), MOVED * self.reach
+        steps = _longest(np.diff(way))
+        moved = np.append(True, steps > near)
+        if np.any((steps > 0.0) & (steps <= near)):  # slow motion adds up
+            last = way[..., 0]
+            for one in range(1, len(ticks)):
+                moved[one] = _longest(way[..., one] - last) > near
+                last = way[..., one] if moved[one] else last
         return np.flatnonzero(moved)
 
     @property
@@ -427,6 +457,12 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
 
 WEIGHED_OF_PAIR = 8
 """The number of ranges of a pair of robots that are always weighed."""
+
+
+def _longest(steps: Array) -> Array:
+    """Return the longest of the `steps` of two ends, an array of ends x 2 x any."""
+    longest: Array = hypot(steps[:, 0], steps[:, 1]).max(axis=0)
+    return longest
 
 
 def _recent(count: int, most: int) -> Places:
