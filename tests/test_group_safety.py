@@ -9,8 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.planning.agenda import Bypass
-from agent.planning.tasks import Orbiting, Travelling
-from agent.planning.visit import BLOCKED_AFTER, YIELDS, leeway, passed, yielding
+from agent.planning.passing import BLOCKED_AFTER, YIELDS, aside, leeway, passed, yielding
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest
@@ -61,24 +60,22 @@ def test_a_robot_stands_still_where_a_range_is_missing() -> None:
     assert leeway([contact("c", None), contact("d", 2.5)], "b", MISSION) == 0.0
 
 
-def test_a_blocked_robot_drives_back_and_aside_and_the_next_time_to_the_other_side() -> None:
-    mode, passing = Travelling((9.0, 0.0)), Bypass()
-    for _ in range(BLOCKED_AFTER):
-        assert passing.places == ()
-        passing = passed(passing, mode, Pose(0.0, 0.0, 0.0), 0.01, MISSION)
-    back, aside = passing.places
-    assert back[0] == aside[0] < -MISSION.safety_distance
+def test_the_way_aside_leads_back_to_one_side_and_past() -> None:
+    back, beside, past = aside(Pose(0.0, 0.0, 0.0), MISSION, 1.0)
+    assert back[0] == beside[0] < -MISSION.safety_distance
     assert back[1] == 0.0
-    assert aside[1] > 2.0 * MISSION.safety_distance
-    again = Bypass(detours=passing.detours, blocked=BLOCKED_AFTER)
-    assert passed(again, mode, Pose(0.0, 0.0, 0.0), 0.01, MISSION).places[1][1] == -aside[1]
+    assert beside[1] == past[1] > 2.0 * MISSION.safety_distance
+    assert past[0] > 2.0 * MISSION.safety_distance
+    assert aside(Pose(0.0, 0.0, 0.0), MISSION, -1.0)[1][1] == -beside[1]
 
 
-def test_a_robot_that_is_free_or_does_not_travel_drives_no_way_aside() -> None:
-    here = Pose(0.0, 0.0, 0.0)
-    nearly = Bypass(blocked=BLOCKED_AFTER)
-    assert passed(nearly, Travelling((9.0, 0.0)), here, 0.5, MISSION).blocked == 0
-    assert passed(nearly, Orbiting(), here, 0.01, MISSION).places == ()
+def test_a_robot_is_blocked_while_little_way_is_left_and_does_not_grow() -> None:
+    passing = Bypass()
+    for ticks in range(BLOCKED_AFTER):
+        assert passing.blocked == ticks
+        passing = passed(passing, 0.01, MISSION)
+    assert passed(passing, 0.02, MISSION).blocked == BLOCKED_AFTER
+    assert passed(passing, 0.5, MISSION).blocked == 0
 
 
 def test_a_robot_yields_to_a_near_one_that_goes_first_but_not_for_ever() -> None:

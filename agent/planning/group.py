@@ -21,6 +21,7 @@ from agent.planning import (
     confirmation,
     exchange,
     meetings,
+    passing,
     plausibility,
     searching,
     visit,
@@ -28,7 +29,6 @@ from agent.planning import (
 from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
 from agent.planning.planner import Planner, Summary
-from agent.planning.separation import slowed
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Deciding, Done, Homing, Orbital, Retreating, Travelling
 from protocol.messages import (
@@ -71,7 +71,7 @@ class GroupPlanner(Planner[RobotState, Report]):
             state = replace(state, in_contact=False)
         if state.agenda.visiting and _is_out_of_range_again(before, state):
             state = state.doing(Travelling(visit.stop(state)))
-        state = visit.passing_others(state, observation.contacts)
+        state = passing.onward(state, observation.contacts)
         if isinstance(state.task, Travelling) and not state.in_contact and not state.agenda.passing.places:
             state = visit.searching(state)
         ended, agenda = isinstance(state.task, Done), state.agenda
@@ -149,7 +149,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         command = self.pair_planner.command(state)
         verdict = state.agenda.robot_verdict
         unconfirmed = config.confirms and verdict is None and isinstance(state.verdict, Localised)
-        controls = slowed(Controls(command.v, command.omega), state.agenda.passing.leeway, config.mission)
+        controls = passing.limited(state, Controls(command.v, command.omega))
         return replace(
             command,
             v=controls.v,

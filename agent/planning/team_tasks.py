@@ -23,9 +23,9 @@ from agent.planning import separation
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.agenda import Bypass
 from agent.planning.drive import pursuit, towards
+from agent.planning.passing import CLEARANCE
 from agent.planning.strides import stride
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
-from agent.planning.visit import CLEARANCE
 from protocol.messages import Undecided
 from protocol.motion import REST, TAU, Controls, Pose
 from protocol.orbits import Orbit

@@ -1,0 +1,156 @@
+"""The way of a robot past those that it does not meet, at the safety distance, by ranges alone.
+
+In each tick, a robot drives at most half of the way that is left to the safety distance, in any direction.
+Two robots that both do so keep it. On its way to another robot, or to its orbit and on it, a robot may then
+be blocked by another one, which stands there or is blocked itself: it drives back, then aside, and on.
+
+One of two goes first, by their ids. Of two that drive to others, the one with the larger id stands still
+until the other one is gone. Of two that are blocked on their orbits, it stands still for a while: the other
+one may be waiting there, and then does not move.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from msgspec.structs import replace
+
+from agent.planning import drive, phase2_orbit, separation, visit
+from agent.planning.agenda import Bypass
+from agent.planning.state import RobotState
+from agent.planning.tasks import Orbital, Orbiting, Travelling, transformed
+from protocol.messages import Contact
+from protocol.mission import Mission
+from protocol.motion import Controls, Pose, compose
+from protocol.sweep_strips import Place
+
+BLOCKED = 0.1
+"""The way that is left in a tick, as a fraction of A_0, below which a robot may be blocked."""
+
+RESERVE = 0.05
+"""The way that robots leave to each other, as a fraction of A_0, but on a way aside.
+
+Without it, two robots come so near that neither has any way left, and both stand there for ever.
+"""
+
+BLOCKED_AFTER = 4
+"""The ticks in which so little way does not grow, after which it drives aside."""
+
+CLEARANCE = 0.25
+"""The distance by which a way aside is longer than needed, and at which robots yield, as a fraction of R."""
+
+YIELDS = 60
+"""The ticks after which a robot does not yield any longer, because the other one does not drive away."""
+
+PATIENCE = 8
+"""The ticks for which a robot that is blocked on its orbit lets one with a smaller id drive aside first."""
+
+
+def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
+    """Return `state` on its way past the robots in contact that it does not meet, after a tick."""
+    mission, passing, task = state.config.mission, state.agenda.passing, state.task
+    if not mission.safety_distance:
+        return state
+    free = leeway(contacts, state.config.peer if state.in_contact else None, mission)
+    before = [one for one in contacts if one.peer < state.config.robot]
+    travelling = [one for one in before if state.other(one.peer).travels]
+    if isinstance(task, Travelling) and yielding(passing, travelling, mission):
+        yielded = passing.yielded + 1
+        return state.with_agenda(passing=replace(passing, leeway=0.0, blocked=0, yielded=yielded))
+    if not _is_on_its_way(state):
+        return state.with_agenda(passing=Bypass(free, detours=passing.detours))
+    now = passed(passing, free, mission)
+    waits = isinstance(task, Orbital) and now.yielded < PATIENCE
+    if now.blocked < BLOCKED_AFTER:
+        if now.places and drive.way_to(state, now.places[0], backward=True) is None:
+            now = replace(now, places=now.places[1:])
+    elif waits and _is_tight(leeway(before, None, mission), mission):
+        now = replace(now, leeway=0.0, yielded=now.yielded + 1)
+    else:
+        places = aside(_course(state), mission, 1.0 if passing.detours % 2 == 0 else -1.0)
+        past = isinstance(task, Orbital) and not passing.places
+        now = Bypass(free, detours=passing.detours + 1, places=places if past else places[:2])
+    state = state.with_agenda(passing=now)
+    if not (now.places or passing.places):
+        return state
+    if isinstance(task, Travelling):  # goes on to the same robot from wherever the way aside ends
+        return state.doing(Travelling(visit.stop(state)))
+    return state.doing(phase2_orbit.aligning(state))
+
+
+def limited(state: RobotState, controls: Controls) -> Controls:
+    """Return `controls`, as far as the robots that the robot does not meet let it drive."""
+    passing, mission = state.agenda.passing, state.config.mission
+    on_way_aside = passing.places and isinstance(state.task, Orbital | Travelling)
+    reserve = 0.0 if on_way_aside else RESERVE * mission.first_straight
+    return separation.slowed(controls, max(0.0, passing.leeway - reserve), mission)
+
+
+def _is_on_its_way(state: RobotState) -> bool:
+    """Return whether the robot drives to another one, to its orbit or on it, and goes on with that later."""
+    match state.task:
+        case Travelling():
+            return True
+        case Orbiting() if state.config.orbit.v == 0.0:
+            return False
+        case Orbital():
+            return bool(state.agenda.passing.places) or drive.controls(state).v != 0.0
+        case _:
+            return False
+
+
+def _course(state: RobotState) -> Pose:
+    """Return where the robot is, with the heading in which it is blocked."""
+    here, task = state.odometry, state.task
+    places = state.agenda.passing.places or ((task.place,) if isinstance(task, Travelling) else ())
+    if places and (here.x, here.y) != places[0]:
+        (x, y), *_ = places
+        return Pose(here.x, here.y, math.atan2(y - here.y, x - here.x))
+    return here if drive.controls(state).v >= 0.0 else compose(here, Pose(0.0, 0.0, math.pi))
+
+
+def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> float:
+    """Return how far in m a robot may drive in the next tick, for all robots in contact but its `peer`.
+
+    `peer` is None if it does not go on with the meeting: then the robot passes it like any other.
+    """
+    free = [
+        0.0 if one.range is None else separation.leeway_of_each(one.range, mission)
+        for one in contacts
+        if one.peer != peer
+    ]
+    return min(free, default=math.inf)
+
+
+def _is_tight(free: float, mission: Mission) -> bool:
+    """Return whether a robot that may drive `free` m in a tick may be blocked."""
+    return free < BLOCKED * mission.first_straight
+
+
+def yielding(passing: Bypass, leading: Sequence[Contact], mission: Mission) -> bool:
+    """Return whether a robot stands still, because one of the robots in `leading`, which go first, is near.
+
+    It does so for YIELDS ticks at most.
+    """
+    near = CLEARANCE * mission.sensing_range
+    close = any(one.range is None or separation.leeway(one.range, mission) < near for one in leading)
+    return close and passing.yielded < YIELDS
+
+
+def passed(passing: Bypass, free: float, mission: Mission) -> Bypass:
+    """Return `passing` after a tick of a robot on its way, where `free` m may be driven next.
+
+    While this is little and grows, one of two robots drives away from the other.
+    """
+    blocked = passing.blocked + (free <= passing.leeway) if _is_tight(free, mission) else 0
+    yielded = passing.yielded if math.isfinite(free) else 0
+    return replace(passing, leeway=free, blocked=blocked, yielded=yielded)
+
+
+def aside(course: Pose, mission: Mission, side: float) -> tuple[Place, ...]:
+    """Return the way aside of a robot that is blocked on its `course`: back, to one `side`, and past."""
+    clearance = CLEARANCE * mission.sensing_range
+    back, beside = mission.safety_distance + clearance, 2.0 * mission.safety_distance + clearance
+    ways = (-back, 0.0), (-back, side * beside), (beside, side * beside)
+    return transformed(course, ways)
