@@ -15,9 +15,9 @@ from hypothesis import strategies as st
 from msgspec.structs import astuple, replace
 
 from agent.estimation.gaussian.claim_agreement import agreement, covariance_union, difference, minus
+from agent.estimation.gaussian.followed_pair import later_pose
 from agent.peer.motion_log import MotionLog
 from agent.planning.group import GroupPlanner
-from agent.planning.own_pose import later_pose
 from agent.planning.state import RobotState
 from agent.planning.tasks import Homing, Listening, Surveying
 from compose.audit.rules import audit_run, replayed

@@ -14,8 +14,8 @@ from itertools import combinations
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import united
+from agent.estimation.gaussian.followed_pair import later_pose
 from agent.planning import appointments
-from agent.planning.own_pose import later_pose
 from agent.planning.state import RobotState
 from protocol.messages import Undecided
 

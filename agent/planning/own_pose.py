@@ -11,14 +11,13 @@ from collections.abc import Sequence
 
 from msgspec.structs import astuple, replace
 
-from agent.estimation.claim import NORMAL_RATIO, Blocked, blocked, claim, consistency, convergence
+from agent.estimation.claim import NORMAL_RATIO, Blocked, claim
 from agent.estimation.gaussian.claim_agreement import difference
+from agent.estimation.gaussian.followed_pair import followed_later
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import pair_of
-from agent.estimation.gaussian.search import search
-from agent.estimation.judged import Judged, User, of_pair
-from agent.estimation.knowledge import Knowledge
-from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow, settled
+from agent.estimation.judged import Judged
+from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow
 from agent.planning.state import RobotState
 from agent.planning.tasks import Looping, Sweeping, transformed
 from protocol.messages import Localised, ReportedPose
@@ -61,7 +60,7 @@ def updated(state: RobotState) -> RobotState:
     ranged |= bool(state.mutual) and state.mutual[-1].tick == state.tick
     if before is not None and state.tick - before < (REFIT_WITH_RANGES if ranged else REFIT):
         return state
-    return _with_estimate(state, *_estimated("finder", state, _measured(state), searched=False))
+    return _with_estimate(state, *followed_later("finder", state, _measured(state), searched=False))
 
 
 def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
@@ -71,7 +70,7 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     describes, so there must be RANGES_AGAIN. If poses many sigmas away are likelier than the ellipse says,
     the covariance is widened until it says as much, but at most by MOST_WIDENED.
     """
-    found, judged = _estimated("finder", state, _measured(state), searched=True)
+    found, judged = followed_later("finder", state, _measured(state), searched=True)
     state = _with_estimate(state, found, judged)
     reference = _reference(state, judged)
     return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
@@ -99,21 +98,6 @@ def beacon_place(state: RobotState) -> Place:
         return state.config.peer_anchor.x, state.config.peer_anchor.y
     x, y, _ = found[0].fit.poses[1 if state.config.role == "a" else 0].tolist()
     return state.config.m1.x + x, state.config.m1.y + y
-
-
-def _estimated(
-    user: User, known: Knowledge, measured: JointMeasurements, *, searched: bool
-) -> tuple[tuple[Hypothesis, ...], Judged | None]:
-    """Return the hypotheses by what was `measured`, and the first one as `claim` sees it for `user`.
-
-    The whole plane is searched if the `known` hypotheses do not explain it, or if `searched`.
-    """
-    found = settled(Posterior(PAIR, known.belief.pair), measured)
-    judged = None if searched else of_pair(user, known.config, found.hypotheses, measured)
-    if blocked(judged, (convergence, consistency)) is not None:
-        found = settled(search(measured, found), measured)
-        judged = of_pair(user, known.config, found.hypotheses, measured)
-    return found.hypotheses, judged
 
 
 def _measured(state: RobotState) -> JointMeasurements:
@@ -162,16 +146,3 @@ def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:
     factor = max(NORMAL_RATIO / min(judged.rival.log_likelihood_ratio, -SMALLEST_LOSS), 1.0)
     covariance = Covariance(*[factor * one for one in astuple(found.covariance)])
     return ReportedPose(state.tick, found.pose, covariance)
-
-
-def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
-    """Return the present pose by the meeting in which the robot claimed a pose; None if it is not known well.
-
-    `met` is the robot's knowledge at that claim, and `now` has its later odometry and ranges to its anchor.
-    Its heading in <W> follows from the meeting alone, but beside its anchor its position hardly depends on
-    that. The conditions are those of `claim`, after a search of the whole plane. Without it, a fit after a
-    long way was 0.3 m off, with a sigma of 0.02 m.
-    """
-    met = replace(met, tick=now.tick, odometry=now.odometry, log=now.log)
-    claimed = claim(_estimated("meeting", met, pair_of(met), searched=True)[1])
-    return claimed if isinstance(claimed, Localised) else None

@@ -20,8 +20,8 @@ from agent.estimation import resection
 from agent.estimation.resection import RangedPlace
 from agent.planning import sweep
 from agent.planning.planner import Summary
-from agent.planning.searching import LOOPS_FOR
 from agent.planning.state import RobotState
+from agent.planning.sweep import LOOPS_FOR
 from agent.planning.tasks import UNCONFIRMED, Awaiting, Done, Looping, Standing
 from protocol.messages import Estimate, Localised, Report
 from protocol.motion import ORIGIN, Pose, compose, inverse, wrap

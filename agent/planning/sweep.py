@@ -1,17 +1,30 @@
-"""The ways of a sweep of an area, and the loops of a robot that stops for one without an anchor."""
+"""The sweep of an area by a robot that looks for others without an anchor, and its loops beside them.
+
+With exact sensors, it knows its pose by dead reckoning, stops for all robots that are near, and leaves half
+of its strips to those that it has found.
+"""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 
 from msgspec.structs import replace
 
+from agent.planning import exchange
 from agent.planning.drive import way_to
 from agent.planning.state import RobotState
 from agent.planning.tasks import Looping, Sweeping, transformed
+from protocol.messages import Report, ReportedPose
 from protocol.motion import inverse
-from protocol.sweep_strips import SIDE, Place
+from protocol.sweep_strips import SIDE, STRIP_REACH, Place
+
+LINGER = 10
+"""The ticks without a range to robots without an anchor after which a contact with them is over."""
+
+LOOPS_FOR = 200
+"""The ticks after which robots stop driving squares that have localised nobody: the other one may be dead."""
 
 
 def looping(state: RobotState, since: int, then: tuple[Place, ...] = ()) -> Looping:
@@ -44,20 +57,6 @@ def onward(state: RobotState, task: Sweeping | Looping) -> Sweeping | Looping:
     while task.places and way_to(state, task.places[0]) is None:
         task = replace(task, places=task.places[1:])
     return task
-
-
-def reports_covariance(state: RobotState) -> bool:
-    """Return whether robots without an anchor need the covariance of a pose that is reported to them."""
-    return bool(state.config.unanchored) and state.estimator.corrects_poses
-
-
-def shares(state: RobotState) -> bool:
-    """Return whether robots that were found search with those that have found them.
-
-    With noisy sensors they cannot, because they have no anchor and no beacon that correct their odometry. If
-    robots may report false data, their poses are not independent of those that have found them.
-    """
-    return not (reports_covariance(state) or state.config.tolerates)
 
 
 def strips(state: RobotState) -> tuple[int, int] | None:
@@ -102,6 +101,7 @@ def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
     part = area.part_of(begin, reach)
     if first == end:  # it begins with the next part
         return replace(state, config=replace(state.config, part=part + 1))
+    state = state.with_agenda(parts=state.agenda.parts + 1)
     state = along(replace(state, config=replace(state.config, part=part)), (first, end))
     assert isinstance(state.task, Sweeping)
     here = (state.odometry.x, state.odometry.y)
@@ -113,8 +113,42 @@ def along(state: RobotState, chosen: tuple[int, int]) -> RobotState:
     config, agenda = state.config, state.agenda
     assert config.sweep is not None
     path = config.sweep.path(chosen, config.mission.sensing_range)
-    state = state.with_agenda(parts=agenda.parts + 1, strips_end=chosen[1] if shares(state) else None)
+    state = state.with_agenda(strips_end=None if state.config.tolerates else chosen[1])
     return state.doing(Sweeping(transformed(inverse(agenda.frame), path)))
+
+
+def told(state: RobotState, peer: str, report: Report) -> Report:
+    """Return `report` with the present pose of the robot, which is the same for each `peer`."""
+    del peer
+    pose = exchange.reported_pose(state, state.agenda.frame)
+    return replace(report, prior=ReportedPose(state.tick, pose))
+
+
+def begun(state: RobotState, part: int) -> RobotState:
+    """Return `state` at the begin of the sweep of a part of the area."""
+    area = state.config.sweep
+    assert area is not None
+    return along(state, area.strips_of(part, state.config.mission.sensing_range))
+
+
+def passed(state: RobotState, helped: Sequence[str]) -> RobotState:
+    """Return `state` after a tick of a sweep, and stops for those of `helped` that are near."""
+    near = [one for one in helped if _is_near(state, one)]
+    return moved_on(state, near, partial(looping, state), stops=bool(near), longest=LOOPS_FOR)
+
+
+def ticks_since(state: RobotState, robot: str) -> int:
+    """Return the number of ticks since the latest range to `robot`; many if there is none."""
+    mutual = state.other(robot).mutual
+    return state.tick - mutual[-1].tick if mutual else LINGER + 1
+
+
+def _is_near(state: RobotState, robot: str) -> bool:
+    """Return whether this robot is near enough to `robot` to drive a square, or drives one already."""
+    near = STRIP_REACH * state.config.mission.sensing_range
+    if ticks_since(state, robot) > 0:
+        return False
+    return isinstance(state.task, Looping) or state.other(robot).mutual[-1].range <= near
 
 
 def moved_on(

@@ -36,10 +36,9 @@ class UnanchoredPlanner(LogPlanner):
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
         state = RobotState(config, task=Awaiting())
-        if not sweep.reports_covariance(state):
-            return state.with_agenda(found=Resected(), alone=True)
-        library()  # it is needed when the robot is found, and would end the mission then
-        return state.with_agenda(found=Contacted(), alone=True)
+        if state.estimator.corrects_poses:
+            library()  # it is needed when the robot is found, and would end the mission then
+        return state.with_agenda(found=searching.search_of(state).found, alone=True)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose.

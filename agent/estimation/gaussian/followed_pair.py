@@ -1,4 +1,7 @@
-"""The estimate of a pair with noisy sensors: its hypotheses from tick to tick, their tests, and the claim."""
+"""The estimate of a pair with noisy sensors: its hypotheses from tick to tick, their tests, and the claim.
+
+After the claim, ranges to the anchor and to the peer are measurements of the same meeting.
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,18 @@ from typing import NamedTuple
 import numpy as np
 from msgspec.structs import replace
 
-from agent.estimation.claim import BEFORE_SEARCH, CONDITIONS, Blocked, Condition, blocked, profiles, rivals
+from agent.estimation.claim import (
+    BEFORE_SEARCH,
+    CONDITIONS,
+    Blocked,
+    Condition,
+    blocked,
+    claim,
+    consistency,
+    convergence,
+    profiles,
+    rivals,
+)
 from agent.estimation.following import SEARCHED_AT
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -24,7 +38,7 @@ from agent.estimation.gaussian.planning_hypotheses import (
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, User, of_pair
 from agent.estimation.knowledge import Attempt, Belief, Knowledge
-from agent.estimation.posterior import PAIR, Posterior, settled
+from agent.estimation.posterior import PAIR, Hypothesis, Posterior, settled
 from protocol.messages import Localised, Undecided, Verdict
 
 
@@ -136,3 +150,34 @@ def _searched(
             attempt = replace(attempt, doubtful_claims=0)
             hypotheses = (hypotheses[0], judged.rival.hypothesis, *hypotheses[1:])
     return FollowedPair(measured, replace(belief, attempt=attempt), hypotheses, verdict)
+
+
+# --- after the claim ----------------------------------------------------------------------------------
+
+
+def followed_later(
+    user: User, known: Knowledge, measured: JointMeasurements, *, searched: bool
+) -> tuple[tuple[Hypothesis, ...], Judged | None]:
+    """Return the hypotheses by what was `measured` since the claim, too, and the first one as `user` sees it.
+
+    The whole plane is searched if the `known` hypotheses do not explain it, or if `searched`.
+    """
+    found = settled(Posterior(PAIR, known.belief.pair), measured)
+    judged = None if searched else of_pair(user, known.config, found.hypotheses, measured)
+    if blocked(judged, (convergence, consistency)) is not None:
+        found = settled(search(measured, found), measured)
+        judged = of_pair(user, known.config, found.hypotheses, measured)
+    return found.hypotheses, judged
+
+
+def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
+    """Return the present pose by the meeting in which the robot claimed a pose; None if it is not known well.
+
+    `met` is the robot's knowledge at that claim, and `now` has its later odometry and ranges to its anchor.
+    Its heading in <W> follows from the meeting alone, but beside its anchor its position hardly depends on
+    that. The conditions are those of `claim`, after a search of the whole plane. Without it, a fit after a
+    long way was 0.3 m off, with a sigma of 0.02 m.
+    """
+    met = replace(met, tick=now.tick, odometry=now.odometry, log=now.log)
+    claimed = claim(followed_later("meeting", met, pair_of(met), searched=True)[1])
+    return claimed if isinstance(claimed, Localised) else None
