@@ -9,7 +9,17 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.planning.agenda import Bypass
-from agent.planning.passing import BLOCKED_AFTER, YIELDS, aside, leeway, passed, yielding
+from agent.planning.passing import (
+    BLOCKED_AFTER,
+    PATIENCE,
+    RESERVE,
+    YIELDS,
+    aside,
+    leeway,
+    limited,
+    passed,
+    yielding,
+)
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest
@@ -17,7 +27,7 @@ from compose.recording.run import of_frames
 from compose.scenario.scenario_file import validate
 from protocol.messages import Contact
 from protocol.mission import Mission
-from protocol.motion import Pose
+from protocol.motion import Controls, Pose
 from tests.groups import localised, table_of
 from tests.missions import kept
 from tests.series import series
@@ -69,13 +79,35 @@ def test_the_way_aside_leads_back_to_one_side_and_past() -> None:
     assert aside(Pose(0.0, 0.0, 0.0), MISSION, -1.0)[1][1] == -beside[1]
 
 
-def test_a_robot_is_blocked_while_little_way_is_left_and_does_not_grow() -> None:
+def ticked(passing: Bypass, free: float, v: float = 1.0, *, waits: bool = False) -> Bypass:
+    return passed(passing, Pose(0.0, 0.0, 0.0), Controls(v, 0.0), free, MISSION, waits=waits)
+
+
+def test_a_robot_is_blocked_while_little_way_is_left_that_does_not_grow() -> None:
     passing = Bypass()
-    for ticks in range(BLOCKED_AFTER):
+    for ticks in range(BLOCKED_AFTER - 1):
         assert passing.blocked == ticks
-        passing = passed(passing, 0.01, MISSION)
-    assert passed(passing, 0.02, MISSION).blocked == BLOCKED_AFTER
-    assert passed(passing, 0.5, MISSION).blocked == 0
+        passing = ticked(passing, 0.01)
+    assert ticked(passing, 0.02).blocked == BLOCKED_AFTER - 1
+    assert ticked(passing, 0.5).blocked == 0
+    assert ticked(passing, 0.01).places[0][0] < 0.0
+    assert ticked(passing, 0.01, -1.0).places[0][0] > 0.0
+    assert ticked(passing, 0.01, 0.0).places == ()
+
+
+def test_one_that_waits_for_another_one_drives_aside_after_it() -> None:
+    passing = Bypass(leeway=0.01, blocked=BLOCKED_AFTER - 1)
+    for _ in range(PATIENCE):
+        passing = ticked(passing, 0.01, waits=True)
+        assert (passing.leeway, passing.places) == (0.0, ())
+    assert ticked(passing, 0.01, waits=True).places
+
+
+def test_robots_keep_a_reserve_but_on_a_way_aside() -> None:
+    ahead, least = Controls(1.0, 0.0), RESERVE * MISSION.first_straight
+    assert limited(ahead, Bypass(leeway=least), MISSION).v == 0.0
+    assert limited(ahead, Bypass(leeway=least, places=((1.0, 0.0),)), MISSION).v == least
+    assert limited(ahead, Bypass(), MISSION) == ahead
 
 
 def test_a_robot_yields_to_a_near_one_that_goes_first_but_not_for_ever() -> None:

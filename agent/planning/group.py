@@ -149,7 +149,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         command = self.pair_planner.command(state)
         verdict = state.agenda.robot_verdict
         unconfirmed = config.confirms and verdict is None and isinstance(state.verdict, Localised)
-        controls = passing.limited(state, Controls(command.v, command.omega))
+        controls = passing.limited(Controls(command.v, command.omega), state.agenda.passing, config.mission)
         return replace(
             command,
             v=controls.v,

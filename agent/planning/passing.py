@@ -60,30 +60,22 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
         return state.with_agenda(passing=replace(passing, leeway=0.0, blocked=0, yielded=yielded))
     if not _is_on_its_way(state):
         return state.with_agenda(passing=Bypass(free, detours=passing.detours))
-    now = passed(passing, free, mission)
-    waits = isinstance(task, Orbital) and now.yielded < PATIENCE
-    if now.blocked < BLOCKED_AFTER:
-        if now.places and drive.way_to(state, now.places[0], backward=True) is None:
-            now = replace(now, places=now.places[1:])
-    elif waits and _is_tight(leeway(before, None, mission), mission):
-        now = replace(now, leeway=0.0, yielded=now.yielded + 1)
-    else:
-        places = aside(_course(state), mission, 1.0 if passing.detours % 2 == 0 else -1.0)
-        past = isinstance(task, Orbital) and not passing.places
-        now = Bypass(free, detours=passing.detours + 1, places=places if past else places[:2])
-    state = state.with_agenda(passing=now)
-    if not (now.places or passing.places):
-        return state
-    if isinstance(task, Travelling):  # goes on to the same robot from wherever the way aside ends
-        return state.doing(Travelling(visit.stop(state)))
-    return state.doing(phase2_orbit.aligning(state))
+    if passing.places:  # what it does after the way aside begins where that ends
+        on_visit = isinstance(task, Travelling)
+        state = state.doing(Travelling(visit.stop(state)) if on_visit else phase2_orbit.aligning(state))
+        if drive.way_to(state, passing.places[0], backward=True) is None:
+            passing = replace(passing, places=passing.places[1:])
+            state = state.with_agenda(passing=passing)
+    waits = isinstance(task, Orbital) and is_tight(leeway(before, None, mission), mission)
+    now = passed(passing, state.odometry, drive.controls(state), free, mission, waits=waits)
+    if now.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
+        now = replace(now, places=now.places[:2])  # what it does next leads past
+    return state.with_agenda(passing=now)
 
 
-def limited(state: RobotState, controls: Controls) -> Controls:
-    """Return `controls`, as far as the robots that the robot does not meet let it drive."""
-    passing, mission = state.agenda.passing, state.config.mission
-    on_way_aside = passing.places and isinstance(state.task, Orbital | Travelling)
-    reserve = 0.0 if on_way_aside else RESERVE * mission.first_straight
+def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:
+    """Return `controls`, as far as other robots let a robot drive, which is on a way aside or not."""
+    reserve = 0.0 if passing.places else RESERVE * mission.first_straight
     return separation.slowed(controls, max(0.0, passing.leeway - reserve), mission)
 
 
@@ -100,16 +92,6 @@ def _is_on_its_way(state: RobotState) -> bool:
             return False
 
 
-def _course(state: RobotState) -> Pose:
-    """Return where the robot is, with the heading in which it is blocked."""
-    here, task = state.odometry, state.task
-    places = state.agenda.passing.places or ((task.place,) if isinstance(task, Travelling) else ())
-    if places and (here.x, here.y) != places[0]:
-        (x, y), *_ = places
-        return Pose(here.x, here.y, math.atan2(y - here.y, x - here.x))
-    return here if drive.controls(state).v >= 0.0 else compose(here, Pose(0.0, 0.0, math.pi))
-
-
 def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> float:
     """Return how far in m a robot may drive in the next tick, for all robots in contact but its `peer`.
 
@@ -123,7 +105,7 @@ def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> f
     return min(free, default=math.inf)
 
 
-def _is_tight(free: float, mission: Mission) -> bool:
+def is_tight(free: float, mission: Mission) -> bool:
     """Return whether a robot that may drive `free` m in a tick may be blocked."""
     return free < BLOCKED * mission.first_straight
 
@@ -138,14 +120,23 @@ def yielding(passing: Bypass, leading: Sequence[Contact], mission: Mission) -> b
     return close and passing.yielded < YIELDS
 
 
-def passed(passing: Bypass, free: float, mission: Mission) -> Bypass:
-    """Return `passing` after a tick of a robot on its way, where `free` m may be driven next.
+def passed(
+    passing: Bypass, here: Pose, controls: Controls, free: float, mission: Mission, *, waits: bool
+) -> Bypass:
+    """Return `passing` after a tick that led `here`, if `free` m of the next `controls` may be driven.
 
-    While this is little and grows, one of two robots drives away from the other.
+    While this is little and grows, one of two robots drives away from the other. One that is blocked stands
+    still first if it `waits` for another one to drive aside.
     """
-    blocked = passing.blocked + (free <= passing.leeway) if _is_tight(free, mission) else 0
+    blocked = passing.blocked + (free <= passing.leeway) if is_tight(free, mission) else 0
     yielded = passing.yielded if math.isfinite(free) else 0
-    return replace(passing, leeway=free, blocked=blocked, yielded=yielded)
+    if blocked < BLOCKED_AFTER or controls.v == 0.0:
+        return replace(passing, leeway=free, blocked=blocked, yielded=yielded)
+    if waits and yielded < PATIENCE:
+        return replace(passing, leeway=0.0, blocked=blocked, yielded=yielded + 1)
+    course = here if controls.v > 0.0 else compose(here, Pose(0.0, 0.0, math.pi))
+    places = aside(course, mission, 1.0 if passing.detours % 2 == 0 else -1.0)
+    return Bypass(free, detours=passing.detours + 1, places=places)
 
 
 def aside(course: Pose, mission: Mission, side: float) -> tuple[Place, ...]:

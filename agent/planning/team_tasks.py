@@ -23,11 +23,11 @@ from agent.planning import separation
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.agenda import Bypass
 from agent.planning.drive import pursuit, towards
-from agent.planning.passing import CLEARANCE
+from agent.planning.passing import is_tight, limited, passed
 from agent.planning.strides import stride
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
 from protocol.messages import Undecided
-from protocol.motion import REST, TAU, Controls, Pose
+from protocol.motion import TAU, Controls, Pose
 from protocol.orbits import Orbit
 from protocol.sweep_ticks import sweep_speed
 from protocol.team_motion import loop, loop_ticks, nearest_other, spiral, way_past
@@ -47,24 +47,6 @@ With less, missions in which the next ranges would suffice take longer by these 
 LAPS = (0.0, 0.5, -0.5, 1.0, -1.0)
 """The distances by which consecutive laps of the way past an anchor lie outside it, in units of R."""
 
-ELSEWHERE_TURNS = (math.pi, 2.4)
-"""The angles (rad) from one blocked way aside to the next: the way back, and about the golden one."""
-
-ELSEWHERE_AFTER = 2
-"""The ticks on a way aside after which it leads to a robot, if none of them leaves more way than before.
-
-A way that leads away leaves half as much again in each tick, and one that leads there half as much.
-"""
-
-PATIENCE = 8
-"""The ticks without more way after which a robot waits no longer for later ones, which may stand."""
-
-NEARLY_BLOCKED = 0.25
-"""The way that is left in a tick, as a fraction of A_0, below which a robot drives aside.
-
-With less, noisy ranges leave no way at all, in any direction, before it does.
-"""
-
 
 def next_task(state: TeamState) -> TeamState:
     """Return `state` with the task and the controls of the next tick: the first that has a reason."""
@@ -78,48 +60,25 @@ def next_task(state: TeamState) -> TeamState:
 
 
 def _passing_robots(state: TeamState) -> TeamState:
-    """Return `state` with the way that the safety distance leaves; if it is blocked, on a way aside.
-
-    Of two robots that block each other, the later one of the team makes way, and the other one waits. Ranges
-    tell no direction: it drives back and to one side; while what is left does not grow, elsewhere.
-    """
-    mission, here, passing, own = state.config.mission, state.odometry, state.passing, state.own
+    """Return `state` with the way that the safety distance leaves; if it is blocked, on a way aside."""
+    mission, here, own = state.config.mission, state.odometry, state.own
     if not mission.safety_distance:
         return state
     free = {one: separation.leeway_of_each(rho, mission) for one, rho in state.apart.items()}
-    tight = {one for one, left in free.items() if left < NEARLY_BLOCKED * mission.first_straight}
-    leeway, driven = min(free.values(), default=math.inf), state.log.logs[own][-1].executed
-    grown = leeway > passing.leeway
-    stuck = bool(tight) and not grown and driven is not None and driven.v != 0.0
-    blocked = passing.blocked + 1 if stuck else passing.blocked if tight and not grown else 0
-    yielded = passing.yielded if tight and not grown else 0
-    passing = replace(passing, leeway=leeway, blocked=blocked, yielded=yielded)
-    if passing.places and (_aside(passing, state) is None or state.controls == REST):
-        passing = replace(passing, places=passing.places[1:] if state.controls != REST else ())
-    v = (_aside(passing, state) or state.controls).v
-    waits = yielded < PATIENCE and any(state.team.robots.index(one) > own for one in tight)
-    if tight and v and waits and not passing.places:
-        passing = replace(passing, leeway=leeway, yielded=yielded + 1)
-    elif tight and v and (not passing.places or blocked >= ELSEWHERE_AFTER):
-        bearing, away = here.heading, mission.safety_distance + CLEARANCE * mission.sensing_range
-        side = math.pi / 2 if passing.detours % 2 == 0 else -math.pi / 2
-        if passing.places:
-            x, y = passing.places[0]
-            bearing = math.atan2(y - here.y, x - here.x) + ELSEWHERE_TURNS[passing.detours % 2]
-        elif v > 0.0:
-            bearing += math.pi
-        x, y = here.x + away * math.cos(bearing), here.y + away * math.sin(bearing)
-        beside = x + away * math.cos(bearing + side), y + away * math.sin(bearing + side)
-        passing = replace(passing, blocked=0, detours=passing.detours + 1, places=((x, y), beside))
-    return replace(state, passing=passing)
+    before = [left for one, left in free.items() if state.team.robots.index(one) < own]
+    passing, least = state.passing, min(free.values(), default=math.inf)
+    if passing.places and _aside(passing, state) is None:
+        passing = replace(passing, places=passing.places[1:])
+    controls, waits = (
+        _aside(passing, state) or state.controls,
+        any(is_tight(left, mission) for left in before),
+    )
+    return replace(state, passing=passed(passing, here, controls, least, mission, waits=waits))
 
 
 def safe_controls(state: TeamState) -> Controls:
     """Return the controls of the task, or aside of it, at a speed that keeps the safety distance."""
-    controls, passing = _aside(state.passing, state) or state.controls, state.passing
-    waits = passing.yielded > 0 and not passing.places
-    most = 0.0 if waits else passing.leeway / state.config.mission.period
-    return Controls(min(max(controls.v, -most), most), controls.omega)
+    return limited(_aside(state.passing, state) or state.controls, state.passing, state.config.mission)
 
 
 def _aside(passing: Bypass, state: TeamState) -> Controls | None:
