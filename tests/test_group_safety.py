@@ -138,6 +138,28 @@ def test_all_robots_keep_the_distance_and_are_localised_within_the_bound(
     assert run.end.tick * scenario.mission.period <= scenario.meetings[-1].ends
 
 
+def test_a_robot_on_its_orbit_makes_way_for_one_that_waits_there() -> None:
+    """A hunt found this group: r3 and r1, which wait for others, stopped for each other for ever."""
+    table = {
+        "name": "blocked",
+        "seed": 76739130,
+        "mission": {
+            "sensing_range": 2.1,
+            "period": 0.77,
+            "max_speed": 1.0,
+            "max_turn_rate": 3.455751918948773,
+            "safety_distance": 0.3,
+        },
+        "group": {"robots": 4, "spacing": 30.0},
+    }
+    run = of_frames(kept(validate(table, "blocked.toml").scenario))
+    assert localised(run) == set(run.robots)
+    assert audit_run(run).violations == ()
+    least = nearest(run)
+    assert least is not None
+    assert least >= 0.3 - 1e-9
+
+
 @pytest.mark.long
 def test_the_audit_of_a_group_with_a_safety_distance_is_clean() -> None:
     found = audit_run(of_frames(kept(group_apart(4, 10, 1.0))))
