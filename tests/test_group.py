@@ -14,6 +14,7 @@ from hypothesis import example, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
+from agent.estimation.knowledge import Knowledge
 from agent.planning import meetings
 from agent.planning.agenda import Fix
 from agent.planning.appointments import PEER_LOST_AFTER
@@ -176,7 +177,7 @@ def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
     planner = planner_of(config)
     state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
     state = replace(state, task=Done(3, claim), in_contact=True).with_agenda(
-        fix=Fix(0, claim, (config.peer,))
+        fix=Fix(Knowledge(config, 0), claim, (config.peer,))
     )
     state = state.with_agenda(robot_verdict=claim, silence=silence)
     assert meetings.onward(state, peer_has_left=refused).agenda.visiting == leaves

@@ -220,7 +220,7 @@ def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
     assert config.confirms
     assert isinstance(after.agenda.robot_verdict, Localised)
     assert after.agenda.fix is not None
-    assert after.agenda.fix.tick < after.tick  # no meeting has just ended
+    assert after.agenda.fix.known.tick < after.tick  # no meeting has just ended
     planner = planner_of(config)
 
     def decided(gives_up: float) -> RobotState:

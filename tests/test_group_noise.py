@@ -10,6 +10,7 @@ import pytest
 from msgspec.structs import replace
 
 from agent.estimation.gaussian.claim_agreement import difference
+from agent.estimation.knowledge import Knowledge
 from agent.peer.motion_log import MotionLog
 from agent.planning import meetings
 from agent.planning.agenda import Fix, Other
@@ -108,7 +109,7 @@ def after_meetings(agreeing: tuple[str, ...]) -> RobotState:
     assert isinstance(planner, GroupPlanner)
     state = planner.start(config.in_meeting("r1", "a"))
     claim = Localised(ORIGIN, SMALL)
-    return state.with_agenda(robot_verdict=claim, fix=Fix(0, claim, agreeing))
+    return state.with_agenda(robot_verdict=claim, fix=Fix(Knowledge(state.config, 0), claim, agreeing))
 
 
 def test_a_pose_on_which_two_meetings_agree_stays_and_the_third_peer_is_not_met_again() -> None:

@@ -58,8 +58,8 @@ class OwnPose(msgspec.Struct, frozen=True):
 class Fix(msgspec.Struct, frozen=True):
     """The pose that a robot knows, by its latest meeting that agrees with the earlier ones."""
 
-    tick: int
-    """The tick in which it claimed the pose in that meeting."""
+    known: Knowledge
+    """The knowledge in the tick in which it claimed the pose in that meeting."""
     claim: Localised
     """That claim."""
     peers: tuple[str, ...]
@@ -108,8 +108,6 @@ class Agenda(msgspec.Struct, frozen=True):
     """
     fix: Fix | None = None
     """The pose that the robot knows, and by which it drives; None until a meeting has determined it."""
-    located: Knowledge | None = None
-    """The knowledge at its claim in the latest meeting in which it was localised."""
     confirming: Confirming = Confirming()
     """The meetings that confirm that pose, if a claim of it needs several peers."""
     found: Resected | Contacted | None = None

@@ -184,7 +184,7 @@ def parted(state: RobotState, failure: Verdict | None = None) -> RobotState:
 def withdrawn(state: RobotState, peer: str, failure: Verdict) -> RobotState:
     """Return `state` after `failure`: the pose is unknown again, and the meeting with `peer` has failed."""
     failed = state.with_other(peer, failed=True)
-    return failed.with_agenda(robot_verdict=None, fix=None, located=None, failure=failure)
+    return failed.with_agenda(robot_verdict=None, fix=None, failure=failure)
 
 
 def is_met(state: RobotState) -> bool:

@@ -42,21 +42,22 @@ def told(state: RobotState, peer: str, report: Report) -> Report:
 
 def begun(state: RobotState, part: int) -> RobotState:
     """Return `state` at the begin of the sweep of a part. A beacon sweeps none, and stays where it is."""
-    config, located = state.config, state.agenda.located
+    config, fix = state.config, state.agenda.fix
     assert config.sweep is not None
     if config.part >= config.sweep.parts:
         assert state.agenda.robot_verdict is not None
         return state.doing(Done(3, state.agenda.robot_verdict))
-    assert located is not None
+    assert fix is not None
+    known = fix.known
     # after a visit in vain, or one that contradicts what this robot knows
-    if not state.belief.pair or config.peer != located.config.peer:
+    if not state.belief.pair or config.peer != known.config.peer:
         state = replace(
             state,
-            config=located.config,
-            mutual=located.mutual,
-            own_anchor=located.own_anchor,
-            belief=located.belief,
-            peer_state=located.peer_state,
+            config=known.config,
+            mutual=known.mutual,
+            own_anchor=known.own_anchor,
+            belief=known.belief,
+            peer_state=known.peer_state,
         )
     due = replace(state.agenda.own_pose, estimated_tick=None, reference=None)
     state = own_pose.updated(state.with_agenda(own_pose=due))

@@ -105,7 +105,7 @@ def _with_verdict(state: RobotState) -> RobotState:
 def _is_comparison_due(state: RobotState) -> bool:
     """Return whether the robot compares the poses of its meetings: after each, and beside its anchor."""
     fix, ranges = state.agenda.fix, state.log.ranges
-    if fix is not None and fix.tick == state.tick:
+    if fix is not None and fix.known.tick == state.tick:
         return True
     if not (state.waits and ranges and ranges[-1].tick == state.tick):
         return False

@@ -72,13 +72,13 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
     if state.config.confirms:
         earlier = [one for one in agenda.confirming.meetings if one.config.peer != peer]
         confirming = replace(agenda.confirming, meetings=(*earlier, known))
-        fix = Fix(state.tick, claim, (peer,))
-        return state.with_agenda(fix=fix, located=known, confirming=confirming).with_frame(claim.pose)
+        fix = Fix(known, claim, (peer,))
+        return state.with_agenda(fix=fix, confirming=confirming).with_frame(claim.pose)
     state = state.with_other(peer, localised=True)
     off = contradiction(state, claim)
     if off is None:
-        fix = Fix(state.tick, claim, (*(fix.peers if fix is not None else ()), peer))
-        state = state.with_agenda(fix=fix, located=known).with_frame(claim.pose)
+        fix = Fix(known, claim, (*(fix.peers if fix is not None else ()), peer))
+        state = state.with_agenda(fix=fix).with_frame(claim.pose)
         return state if agenda.robot_verdict is not None else state.with_agenda(robot_verdict=claim)
     assert fix is not None
     if len(fix.peers) > 1:

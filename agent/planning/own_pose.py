@@ -84,7 +84,7 @@ def contradiction(state: RobotState, claim: Localised) -> str | None:
     fix, mission = state.agenda.fix, state.config.mission
     if fix is None or claim.covariance is None:
         return None
-    off = difference(fix.claim, fix.tick, claim, state.tick, state.log, mission)
+    off = difference(fix.claim, fix.known.tick, claim, state.tick, state.log, mission)
     if off.p_value >= 1.0 - mission.confidence:
         return None
     return f"{off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
@@ -103,7 +103,7 @@ def beacon_place(state: RobotState) -> Place:
 def _measured(state: RobotState) -> JointMeasurements:
     """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
     measured = pair_of(state)
-    claimed = state.agenda.located.tick if state.agenda.located is not None else -1
+    claimed = state.agenda.fix.known.tick if state.agenda.fix is not None else -1
     return measured.thinned_after(claimed, MOST_WEIGHED)
 
 
