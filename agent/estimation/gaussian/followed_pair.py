@@ -6,7 +6,6 @@ After the claim, ranges to the anchor and to the peer are measurements of the sa
 from __future__ import annotations
 
 from collections.abc import Sequence
-from functools import lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -60,7 +59,7 @@ def followed(knowledge: Knowledge) -> FollowedPair:
     converge, and before a claim or a suspicion.
     """
     first = beginning(knowledge, knowledge.known_through)
-    measured, belief = _shared(pair_of(knowledge)), knowledge.belief
+    measured, belief = pair_of(knowledge), knowledge.belief
     if first != belief.attempt.beginning:
         belief = replace(belief, pair=(), candidates=None, attempt=Attempt(first))
         knowledge = replace(knowledge, belief=belief)
@@ -75,12 +74,6 @@ def followed(knowledge: Knowledge) -> FollowedPair:
         if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
             return FollowedPair(measured, belief, tuple(map(planning_hypothesis, belief.pair)))
     return _searched(knowledge, measured, search(measured, known), mutual)
-
-
-@lru_cache(maxsize=2)
-def _shared(measured: JointMeasurements) -> JointMeasurements:
-    """Return `measured`, or equal ones of the other robot in this process, with what they already cache."""
-    return measured
 
 
 def believed(
