@@ -13,12 +13,10 @@ from agent.planning.passing import (
     BLOCKED_AFTER,
     PATIENCE,
     RESERVE,
-    YIELDS,
     aside,
     leeway,
     limited,
     passed,
-    yielding,
 )
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
@@ -108,13 +106,6 @@ def test_robots_keep_a_reserve_but_on_a_way_aside() -> None:
     assert limited(ahead, Bypass(leeway=least), MISSION).v == 0.0
     assert limited(ahead, Bypass(leeway=least, places=((1.0, 0.0),)), MISSION).v == least
     assert limited(ahead, Bypass(), MISSION) == ahead
-
-
-def test_a_robot_yields_to_a_near_one_that_goes_first_but_not_for_ever() -> None:
-    assert yielding(Bypass(), [contact("a", 0.6)], MISSION)
-    assert not yielding(Bypass(), [contact("a", 2.0)], MISSION)
-    assert not yielding(Bypass(), [], MISSION)
-    assert not yielding(Bypass(yielded=YIELDS), [contact("a", 0.6)], MISSION)
 
 
 # --- missions -----------------------------------------------------------------------------------------

@@ -4,9 +4,8 @@ In each tick, a robot drives at most half of the way that is left to the safety 
 Two robots that both do so keep it. On its way to another robot, or to its orbit and on it, a robot may then
 be blocked by another one, which stands there or is blocked itself: it drives back, then aside, and on.
 
-One of two goes first, by their ids. Of two that drive to others, the one with the larger id stands still
-until the other one is gone. Of two that are blocked on their orbits, it stands still for a while: the other
-one may be waiting there, and then does not move.
+Of two, the one with the smaller id drives aside first. The other one stands still for a while, but not for
+ever: the first one may be at its place, and then does not move.
 """
 
 from __future__ import annotations
@@ -38,13 +37,13 @@ BLOCKED_AFTER = 4
 """The ticks in which so little way does not grow, after which it drives aside."""
 
 CLEARANCE = 0.25
-"""The distance by which a way aside is longer than needed, and at which robots yield, as a fraction of R."""
-
-YIELDS = 60
-"""The ticks after which a robot does not yield any longer, because the other one does not drive away."""
+"""The distance by which a way aside is longer than needed, as a fraction of R."""
 
 PATIENCE = 8
-"""The ticks for which a robot that is blocked on its orbit lets one with a smaller id drive aside first."""
+"""The ticks for which a robot that is blocked stands still if one with a smaller id is near.
+
+With 60, groups take as long; that one may not be on its way.
+"""
 
 
 def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
@@ -54,10 +53,6 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
         return state
     free = leeway(contacts, state.config.peer if state.in_contact else None, mission)
     before = [one for one in contacts if one.peer < state.config.robot]
-    travelling = [one for one in before if state.other(one.peer).travels]
-    if isinstance(task, Travelling) and yielding(passing, travelling, mission):
-        yielded = passing.yielded + 1
-        return state.with_agenda(passing=replace(passing, leeway=0.0, blocked=0, yielded=yielded))
     if not _is_on_its_way(state):
         return state.with_agenda(passing=Bypass(free, detours=passing.detours))
     if passing.places:  # what it does after the way aside begins where that ends
@@ -66,7 +61,7 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
         if drive.way_to(state, passing.places[0], backward=True) is None:
             passing = replace(passing, places=passing.places[1:])
             state = state.with_agenda(passing=passing)
-    waits = isinstance(task, Orbital) and is_tight(leeway(before, None, mission), mission)
+    waits = is_tight(leeway(before, None, mission), mission)
     now = passed(passing, state.odometry, drive.controls(state), free, mission, waits=waits)
     if now.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
         now = replace(now, places=now.places[:2])  # what it does next leads past
@@ -108,16 +103,6 @@ def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> f
 def is_tight(free: float, mission: Mission) -> bool:
     """Return whether a robot that may drive `free` m in a tick may be blocked."""
     return free < BLOCKED * mission.first_straight
-
-
-def yielding(passing: Bypass, leading: Sequence[Contact], mission: Mission) -> bool:
-    """Return whether a robot stands still, because one of the robots in `leading`, which go first, is near.
-
-    It does so for YIELDS ticks at most.
-    """
-    near = CLEARANCE * mission.sensing_range
-    close = any(one.range is None or separation.leeway(one.range, mission) < near for one in leading)
-    return close and passing.yielded < YIELDS
 
 
 def passed(
