@@ -84,7 +84,8 @@ def test_an_invalid_row_is_one_line_with_its_place(
         ("EDGE_SE2 1 A0 A1 0 0 0 1 nan 0 1 0 1", ", line 1: cov_xy: 'nan' is not a number"),
         (
             "VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 B0 1 1",
-            ", line 2: B is neither a robot with odometry nor a known anchor; robots: A; anchors: none",
+            ", line 2: B is neither a robot with odometry nor a known anchor; robots: A; "
+            "anchors: none, and --anchors FILE adds some",
         ),
         ("VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 L0 1 0", ", line 2: variance: 0 is not positive"),
         (
@@ -108,6 +109,12 @@ def test_an_invalid_graph_is_one_line_with_its_place(text: str, says: str, tmp_p
             "unknown column 'rnage'; there may be t, from, to, range, sigma; the column range is missing; "
             "did you mean 'range'?",
         ),
+        (
+            "timestamp,Tag,anchor_id,distance",
+            "unknown columns 'timestamp', 'Tag', 'anchor_id', 'distance'; "
+            "there may be t, from, to, range, sigma; the columns t, from, to, range are missing; "
+            "rename timestamp to t, Tag to from, anchor_id to to, distance to range",
+        ),
         ("t,from,to", "the column range is missing"),
         ("t,t,from,to,range", "there are two columns t"),
         ("", "the columns t, from, to, range are missing"),
@@ -119,6 +126,14 @@ def test_a_wrong_head_of_a_table_is_refused(head: str, says: str, tmp_path: Path
     assert refused(tmp_path) == f"{tmp_path}/ranges.csv, line 1: {says}"
 
 
+def test_radios_that_measured_nothing_are_named(tmp_path: Path) -> None:
+    rows = [{"t": 0.1 * k, "from": "a", "to": "M1", "range": 0.0} for k in range(8)]
+    written_csv(tmp_path, {**TABLES, "ranges": rows})
+    assert refused(tmp_path) == f"{tmp_path}: all 8 ranges of a and M1 are 0 m: nothing was measured"
+    written_csv(tmp_path / "one", {**TABLES, "ranges": [*rows[:7], {**rows[7], "range": 1.0}]})
+    assert read_ranges(tmp_path / "one").ranges.range.max() == 1.0
+
+
 def test_what_is_no_recording_is_refused_with_the_formats(tmp_path: Path) -> None:
     (tmp_path / "notes.txt").write_text("hello")
     formats = (
@@ -126,6 +141,8 @@ def test_what_is_no_recording_is_refused_with_the_formats(tmp_path: Path) -> Non
     )
     assert refused(tmp_path / "notes.txt").startswith(f"{tmp_path}/notes.txt: {formats}")
     assert refused(tmp_path).startswith(f"{tmp_path}: {formats}")
+    (tmp_path / "uwb.csv").write_text("t,from,to,range\n")
+    assert refused(tmp_path).endswith(", or a recording of Tandem; it has uwb.csv")
     assert (
         refused(tmp_path / "none.pyfg") == f"{tmp_path}/none.pyfg cannot be read: No such file or directory"
     )

@@ -263,6 +263,20 @@ def test_the_result_of_a_group_shows_the_truth_at_the_claims_and_the_bound(
     assert f"all robots were localised by tick {tick}; the computed bound is {bound} ticks" in shown
 
 
+def test_the_result_of_a_team_shows_the_true_poses_of_the_ticks_of_the_claims(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    found = summary(run_mission(load("relative")), None, None)
+    result(found)
+    shown = capsys.readouterr().out
+    driven_on = [one for one in found["robots"].values() if one["truth"] != one["truth_at_claim"]]
+    assert driven_on
+    for one in found["robots"].values():
+        x, y, heading = one["truth_at_claim"]
+        assert f" {one['localised_tick']} " in shown
+        assert f"{x:.2f} {y:.2f} {heading:+.2f}" in shown
+
+
 # --- drawn groups and sweeps --------------------------------------------------------------------------
 
 

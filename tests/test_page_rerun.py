@@ -102,9 +102,9 @@ REFUSED: dict[str, tuple[object, int, str]] = {
         422,
         "robots: there is no 'z'; there are a, b",
     ),
-    "R = 0": (values(sensing_range=0.0), 422, "mission.sensing_range: expected 'float' >= 0.001"),
+    "R = 0": (values(sensing_range=0.0), 422, "mission.sensing_range: expected a number >= 0.001"),
     "out of range": (values(robots=moved_a(5.0, 0.0)), 422, "robot[0].start: 'a' is 5.02493781 m from its"),
-    "loss": (values(loss=1.5), 422, "fault[0].loss: expected 'float' <= 1.0"),
+    "loss": (values(loss=1.5), 422, "fault[0].loss: expected a number <= 1.0"),
 }
 
 

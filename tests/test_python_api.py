@@ -324,7 +324,7 @@ def test_an_invalid_argument_raises_the_line_of_the_command(
         ({"kills": "a@3"}, "kills: a run in one process has no processes to kill; set processes=True"),
         ({"rate": 1.0}, "rate: a run in one process cannot run in real time; set processes=True"),
         ({"processes": True, "timeout": 0}, "timeout: 0 is not a positive number"),
-        ({"seed": -1}, "paper-1: seed: expected 'int' >= 0"),
+        ({"seed": -1}, "paper-1: seed: expected a whole number >= 0"),
     ],
 )
 def test_an_argument_that_does_not_fit_is_refused_in_one_line(
@@ -370,7 +370,7 @@ def test_faults_are_texts_or_tables() -> None:
 def test_another_seed_gives_the_scenario_that_its_file_with_this_seed_gives(name: str) -> None:
     scenario = tandem.Scenario.load(name)
     assert scenario.with_(seed=5) == tandem.Scenario.from_dict({**scenario.table, "seed": 5}, name)
-    for wrong, why in ((-1, ">= 0"), (2**63, "<= "), (True, "got 'bool'"), ("5", "got 'str'")):
+    for wrong, why in ((-1, ">= 0"), (2**63, "<= "), (True, "got true or false"), ("5", "got text")):
         with pytest.raises(tandem.BadScenario, match=f"{name}: seed: .*{why}"):
             scenario.with_(seed=wrong)
 

@@ -215,8 +215,8 @@ TILTED.pose.pose.orientation.x = 1.0
     [
         (f"{A}speed = 1", FEW, "/map.toml: topic[0]: unknown field 'speed'"),
         (f"{A}{A[12:]}", FEW, "/map.toml: topic: there are two of one name"),
-        (f"{A}scale = 0", FEW, "/map.toml: topic[0].scale: expected 'float' > 0"),
-        ("bag = 1", FEW, "/map.toml: bag: expected 'str', got 'int'"),
+        (f"{A}scale = 0", FEW, "/map.toml: topic[0].scale: expected a number > 0"),
+        ("bag = 1", FEW, "/map.toml: bag: expected text, got a whole number"),
         ('bag = "other"', FEW, "/other cannot be read: No such file or directory"),
         (
             A.replace("odom", "odo"),
@@ -280,6 +280,12 @@ def test_a_bag_without_a_mapping_is_refused_with_its_topics(tmp_path: Path) -> N
     there = f"messages on /a/odom ({ODOMETRY}): 2, messages on /uwb ({UWB}): 1"
     hint = "a .toml file maps topics of ROS"
     assert refused(moved) == f"{moved}: there is no odometry, but {there}; {hint}"
+
+
+def test_the_folder_of_a_bag_is_refused_like_its_file(tmp_path: Path) -> None:
+    written(tmp_path, FEW, StoragePlugin.MCAP)
+    there = f"messages on /a/odom ({ODOMETRY}): 2, messages on /uwb ({UWB}): 1"
+    assert refused(tmp_path / "bag").startswith(f"{tmp_path}/bag: there is no odometry, but {there}; ")
 
 
 def test_a_bag_of_ros_1_is_read_like_one_of_ros_2(tmp_path: Path) -> None:

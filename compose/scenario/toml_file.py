@@ -14,6 +14,17 @@ from compose.errors import NotToml, no_such
 from protocol import documents, files
 from protocol.spelling import did_you_mean
 
+PLAIN_TYPES = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a table",
+    "null": "nothing",
+}
+"""The words for the types that msgspec's errors name."""
+
 
 def read_text(path: Path) -> str:
     """Return the text of the file.
@@ -42,7 +53,7 @@ def table_in(text: str, source: str) -> dict[str, Any]:
 
 
 def field_first(error: str, schema: type[msgspec.Struct]) -> str:
-    """Return msgspec's `error` with the field in front: "mission.period: expected 'float', got 'str'".
+    """Return msgspec's `error` with the field in front: "mission.period: expected a number, got text".
 
     `schema` is the type of the whole file. From it follow the permitted words of a field, and suggestions.
     """
@@ -58,9 +69,17 @@ def field_first(error: str, schema: type[msgspec.Struct]) -> str:
         what = no_such(word, words)
     elif what.startswith("unknown field"):
         what += did_you_mean(word, known_words(schema, where))
+    elif what.startswith("expected"):
+        what = re.sub(r"'([a-z |]+)'", _plain_types, what)
     if "matching regex" in what:
         what = "invalid name: use letters, digits, - and _, and begin with a letter or digit"
     return f"{where}: {what}" if where else what
+
+
+def _plain_types(quoted: re.Match[str]) -> str:
+    """Return the words for types such as `float | null`, of which null is left out beside another."""
+    kinds = quoted[1].split(" | ")
+    return " or ".join([PLAIN_TYPES.get(one, one) for one in kinds if one != "null" or len(kinds) == 1])
 
 
 def known_words(schema: type[msgspec.Struct], where: str) -> list[str]:

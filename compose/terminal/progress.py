@@ -25,7 +25,7 @@ TABLE_NOTES = (
 )
 """The footnotes, each with its column."""
 RESULT_COLUMNS = (TICK_COLUMN, TRUTH, TRUTH_AT_CLAIM, ESTIMATE, ERROR, SIGMA, RANGES, REPORTS, LATE)
-"""All columns: in a group, robots drive on after their claims; SIGMA and LATE are not shown if empty."""
+"""All columns: but in pairs, robots drive on after their claims; SIGMA and LATE are not shown if empty."""
 NARROWER: tuple[tuple[str, ...], ...] = ((TRUTH, TRUTH_AT_CLAIM), (ESTIMATE,), (RANGES, REPORTS))
 """The columns that are left out one after the other until the table fits."""
 MOST_ROBOTS_AS_LIST = 4
@@ -44,7 +44,8 @@ def result(summary: Mapping[str, Any], rate: float | None = None) -> None:
     exact = all(robot["covariance"] is None for robot in robots.values())
     late = {name: missed for name, robot in robots.items() if (missed := robot["deadlines_missed"])}
     omitted = {*([SIGMA] if exact else []), *([] if late else [LATE])}
-    omitted |= {TICK_COLUMN, TRUTH_AT_CLAIM} if group is None else {TRUTH}
+    in_pairs = group is None and "team" not in summary
+    omitted |= {TICK_COLUMN, TRUTH_AT_CLAIM} if in_pairs else {TRUTH}
     choices = [[column for column in RESULT_COLUMNS if column not in omitted]]
     for narrower in NARROWER if len(robots) > MOST_ROBOTS_AS_LIST else ():
         choices.append([column for column in choices[-1] if column not in narrower])

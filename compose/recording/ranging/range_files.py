@@ -49,6 +49,22 @@ READABLE_FORMATS = (
     "maps a rosbag2, or a recording of Tandem"
 )
 """The formats that can be read."""
+BAG_METADATA = "metadata.yaml"
+"""The file by which the folder of a rosbag2 is known."""
+
+OTHER_NAMES = {
+    "robot": ("robot_id", "id", "name", "agent"),
+    "t": ("time", "timestamp", "stamp", "time_s", "t_s"),
+    "x": ("pos_x", "px", "tx", "x_m", "position_x"),
+    "y": ("pos_y", "py", "ty", "y_m", "position_y"),
+    "heading": ("yaw", "theta", "heading_rad", "yaw_rad"),
+    "from": ("source", "src", "tag", "tag_id", "robot", "robot_id"),
+    "to": ("target", "dst", "anchor", "anchor_id", "beacon", "beacon_id"),
+    "range": ("distance", "dist", "range_m", "distance_m", "rho"),
+    "sigma": ("std", "stddev", "sigma_m"),
+    "anchor": ("anchor_id", "id", "name", "beacon", "landmark"),
+}
+"""The names that other logs give to a column, for suggestions: nothing is read by them."""
 
 
 def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
@@ -60,18 +76,22 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
     """
     try:
         anchors = _anchors(anchors_csv) if anchors_csv is not None else []
-        if path.is_dir() and not any((path / f"{name}.csv").exists() for name in (*ODOMETRY, "ranges")):
+        is_bag = path.suffix in (".toml", ".db3", ".bag") or (path / BAG_METADATA).exists()
+        tables = any((path / f"{name}.csv").exists() for name in (*ODOMETRY, "ranges"))
+        if path.is_dir() and not (tables or is_bag):
             if not journals_in(path):
-                raise BadRecording(f"{path}: it is not {READABLE_FORMATS}")
+                others = sorted(one.name for one in path.glob("*.csv"))
+                has = f"; it has {listed(others)}" if others else ""
+                raise BadRecording(f"{path}: it is not {READABLE_FORMATS}{has}")
             with user_errors(path):
                 return ranges_of_run(read(path), anchors)
         builder = RecordingBuilder(path, anchors)
-        if path.is_dir():
+        if tables:
             for row, place in _tables(path):
                 builder.add(row, place)
         elif path.suffix == ".pyfg":
             add_pyfg(builder, path, _text(path))
-        elif path.suffix in (".toml", ".db3", ".bag"):
+        elif is_bag:
             need("rosbags", extra="ros")
             from compose.recording.ranging.ros_bag import add_bag  # noqa: PLC0415  # optional
 
@@ -160,6 +180,17 @@ def rows_in(path: Path, kind: type[RowKind]) -> Iterator[tuple[RowKind, SourcePl
         raise BadRecording(f"{SourcePlace(path, lines.line_num)}: {error}") from None
 
 
+def _renames(unknown: list[str], free: list[str]) -> list[tuple[str, str]]:
+    """Return columns of a log in `unknown`, each with the column in `free` that it is likely to be."""
+    renames = []
+    for one in unknown:
+        like = [name for name in free if one.lower() in (name, *OTHER_NAMES.get(name, ()))]
+        if like:
+            free = [name for name in free if name != like[0]]
+            renames.append((one, like[0]))
+    return renames
+
+
 def _check_head(head: list[str], kind: type[Row], place: SourcePlace) -> None:
     """Raise BadRecording unless `head` has the columns of `kind`, each once, and all that are required."""
     known = kind.__struct_encode_fields__
@@ -171,6 +202,8 @@ def _check_head(head: list[str], kind: type[Row], place: SourcePlace) -> None:
         absent = f"the columns {listed(missing)} are missing"
     if unknown:
         guess = did_you_mean(unknown[0], known)
+        if renames := _renames(unknown, [name for name in known if name not in head]):
+            guess = f"; rename {listed([f'{one} to {name}' for one, name in renames])}"
         if missing:
             guess = f"; {absent}{guess}"
         if kind is OdometryRow and unknown[0] in PoseRow.__struct_fields__:

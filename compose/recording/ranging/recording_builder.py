@@ -228,14 +228,17 @@ class RecordingBuilder:
         return recording
 
     def _check_times(self, recording: RangeRecording) -> None:
-        """Raise BadRecording if stamps are missing, or not in s.
+        """Raise BadRecording if stamps or ranges are missing, or stamps are not in s.
 
-        Then, all ranges of a pair, or all increments of a robot, are of one time, or most increments that
-        move it are so long that there is no estimate in them.
+        Then, all ranges of a pair are 0, or they or all increments of a robot are of one time, or most
+        increments that move it are so long that there is no estimate in them.
         """
         paths = [(f"increments of {one.id}", one.odometry.t0, one.odometry.t1) for one in recording.robots]
         for pair, rows in recording.pairs().items():
             t = recording.ranges.t[rows]
+            if len(t) >= NOT_AT_ONCE and not np.any(recording.ranges.range[rows]):
+                all_of_them = f"all {len(t)} ranges of {' and '.join(pair)} are 0 m"
+                raise BadRecording(f"{self.source}: {all_of_them}: nothing was measured")
             paths.append((f"ranges of {' and '.join(pair)}", t, t))
         for what, begin, end in paths:
             if len(end) >= NOT_AT_ONCE and begin[-1] == end[0]:
@@ -271,7 +274,7 @@ class RecordingBuilder:
         robots, anchors = [
             listed(some) for some in (names[: len(self._odometry)], names[len(self._odometry) :])
         ]
-        there = f"robots: {robots}; anchors: {anchors or 'none'}"
+        there = f"robots: {robots}; anchors: {anchors or 'none, and --anchors FILE adds some'}"
         return f"is neither a robot with odometry nor a known anchor; {there}{did_you_mean(name, names)}"
 
     def _range_series(self, names: Sequence[str], through_s: float) -> RangeSeries:
