@@ -10,18 +10,18 @@ from tests.expected.results import CellResults, Expected, Quantiles, read
 
 OUTCOMES = ("localised", "undecided", "inconsistent", "wrong", "failed", "refused")
 Column = tuple[str, Callable[[Sequence[CellResults]], str]]
-POOLED_BY = {"partition": 0, "crash-2": 1, "crash": 1}
+POOLED_BY = {"partition": 0}
 """The index of the axis whose values are the rows, in sweeps with many equal cells; else each cell is."""
 
 
 FEWEST_SHOWN = 40
-"""The fewest trials of a cell of which a page shows results."""
+"""The fewest trials of a cell of which a page shows results; else, it shows those of all cells together."""
 
 
 def table(name: str) -> str:
     """Return the table of the sweep `name` in Markdown, with the command that compares it.
 
-    It has the results of earlier runs with more trials; else, those of the cells, if they are enough.
+    It has the results of earlier runs with more trials; else, those of the cells.
     """
     file = read(name)
     assert file is not None
@@ -31,8 +31,9 @@ def table(name: str) -> str:
         lines += [file.notes]
     if file.landed:
         lines += ["", *_landed(file)]
-    elif file.trials >= FEWEST_SHOWN:
-        rows = _rows(file)
+    else:
+        few = file.trials < FEWEST_SHOWN and len(file.cell) > 1
+        rows = {f"all {len(file.cell)} cells": file.cell} if few else _rows(file)
         columns = [column for column in _columns() if any(column[1](cells) for cells in rows.values())]
         lines += [
             "",
