@@ -153,18 +153,22 @@ SIZED double dot(const double *one, const double *other, Index count)
     return total;
 }
 
-/* `matrix` has rows of `width` elements, and `lower` of `end - begin`. Returns 0 if it is not positive. */
-SIZED int cholesky(const double *matrix, Index width, Index begin, Index end, double *lower)
+/* `matrix` has rows of `width` elements, and `lower` of `end - begin`. Returns 0 if it is not positive. Column by
+   column, the elements right of it sum up the products that are subtracted from those of `matrix`. */
+SIZED int cholesky(const double *matrix, Index width, Index begin, Index end, double *column, double *lower)
 {
     const Index size = end - begin;
     memset(lower, 0, sizeof(double) * size * size);
-    for (Index a = 0; a < size; a++)
-        for (Index e = 0; e <= a; e++) {
-            double left = matrix[(begin + a) * width + begin + e] - dot(lower + a * size, lower + e * size, e);
-            if (e < a) lower[a * size + e] = left / lower[e * size + e];
-            else if (left > 0.0) lower[a * size + a] = sqrt(left);
-            else return 0;
+    for (Index e = 0; e < size; e++) {
+        const double left = matrix[(begin + e) * width + begin + e] - lower[e * size + e];
+        if (!(left > 0.0)) return 0;
+        const double root = lower[e * size + e] = sqrt(left);
+        for (Index a = e + 1; a < size; a++) {
+            double *row = lower + a * size;
+            row[e] = column[a] = (matrix[(begin + a) * width + begin + e] - row[e]) / root;
+            add(row + e + 1, row[e], column + e + 1, a - e);
         }
+    }
     return 1;
 }
 
@@ -183,7 +187,7 @@ SIZED void solved(const double *lower, Index size, const double *right, double *
     }
 }
 
-/* The transposed inverse of `lower`, and the inverse by `solved`, for all columns at once. */
+/* The transposed inverse of `lower`, and that inverse, from which `completed` goes on, for all columns at once. */
 SIZED void inverted(const double *lower, Index size, double *row, double *whitening, double *inverse)
 {
     memset(inverse, 0, sizeof(double) * size * size);
@@ -194,18 +198,26 @@ SIZED void inverted(const double *lower, Index size, double *row, double *whiten
         for (Index c = 0; c <= a; c++) inverse[a * size + c] = ((c == a) - row[c]) / lower[a * size + a];
         for (Index c = 0; c <= a; c++) whitening[c * size + a] = inverse[a * size + c];
     }
+}
+
+/* The columns from `begin` to `end` of the inverse of a matrix by that of its `lower`; those before have it. The
+   elements below the diagonal are those above it. */
+SIZED void completed(const double *lower, Index size, Index begin, Index end, double *row, double *inverse)
+{
     for (Index a = size - 1; a >= 0; a--) {
-        for (Index c = 0; c < size; c++) row[c] = -(inverse[a * size + c] /= lower[a * size + a]);
-        for (Index e = 0; e < a; e++) add(inverse + e * size, lower[a * size + e], row, size);
+        double *left = inverse + a * size;
+        for (Index c = begin; c < end; c++) row[c] = -(left[c] /= lower[a * size + a]);
+        for (Index e = 0; e < a; e++)
+            add(inverse + e * size + begin, lower[a * size + e], row + begin, end - begin);
     }
-    for (Index a = 0; a < size; a++)
+    for (Index a = 0; a < end; a++)
         for (Index e = 0; e < a; e++) inverse[a * size + e] = inverse[e * size + a];
 }
 
 SIZED void whitened(const double *whitening, Index size, const double *vector, double *found)
 {
     memset(found, 0, sizeof(double) * size);
-    for (Index e = 0; e < size; e++) add(found, vector[e], whitening + e * size, size);
+    for (Index e = 0; e < size; e++) add(found + e, vector[e], whitening + e * size + e, size - e);
 }
 
 /* --- sizes ------------------------------------------------------------------------------------------ */
@@ -489,7 +501,7 @@ SIZED int limited(const Measured *of, double largest, const double *change, Work
     for (Index a = 0; a < n3; a++) found[a] = change[a] / most;
     for (Index a = n3; a < size; a++)
         w->vector[a - n3] = w->gradient[a] - dot(w->information + a * q, found, n3);
-    if (!cholesky(w->information, q, n3, size, w->inner)) return 0;
+    if (!cholesky(w->information, q, n3, size, w->effect, w->inner)) return 0;
     solved(w->inner, size - n3, w->vector, found + n3);
     return 1;
 }
@@ -498,8 +510,15 @@ SIZED int limited(const Measured *of, double largest, const double *change, Work
 SIZED void misfits(const Measured *of, const double *change, const Work *w, double *found)
 {
     const Index q = unknowns(of), size = estimated(of);
-    for (Index j = 0; j < of->ranges; j++)
-        found[j] = w->innovation[j] - dot(w->effects + j * q, change, size);
+    Index j = 0;
+    for (; j + 4 <= of->ranges; j += 4) { /* four sums at once do not wait for each other */
+        const double *effect = w->effects + j * q;
+        double totals[4] = {0.0, 0.0, 0.0, 0.0};
+        for (Index e = 0; e < size; e++)
+            for (Index t = 0; t < 4; t++) totals[t] += effect[t * q + e] * change[e];
+        for (Index t = 0; t < 4; t++) found[j + t] = w->innovation[j + t] - totals[t];
+    }
+    for (; j < of->ranges; j++) found[j] = w->innovation[j] - dot(w->effects + j * q, change, size);
 }
 
 SIZED double chi2_of(const Measured *of, const double *poses, const double *change, Work *w)
@@ -525,11 +544,14 @@ SIZED void told_by(const Measured *of, const Walk *walk, Index j, Work *w, Step 
     double *effect = w->effect, *weighted = w->weighted;
     for (Index e = 0; e < size; e++) effect[e] = w->effects[j * q + e] / spread;
     for (Index a = 0; a < s; a++) add(effect, -gain[a], w->by_unknowns + a * size, size);
+    int moves = 0; /* with an exact odometry, none do */
     memset(weighted, 0, sizeof(double) * s);
     for (Index e = 0; e < s; e++)
-        if (gain[e] != 0.0)
+        if (gain[e] != 0.0) {
+            moves = 1;
             for (Index a = 0; a < s; a++) weighted[a] += w->weight[a * s + e] * gain[e];
-    to->alone[j] = 1.0 / spread + dot(gain, weighted, s);
+        }
+    to->alone[j] = 1.0 / spread + (moves ? dot(gain, weighted, s) : 0.0);
     const Row row = row_of(of, walk, j);
     for (int t = 0; t < row.count; t++) {
         const Index a = row.at[t];
@@ -537,6 +559,7 @@ SIZED void told_by(const Measured *of, const Walk *walk, Index j, Work *w, Step 
         w->told[a] += h * to->multipliers[j];
         w->told_limited[a] += h * to->own[j];
         add(w->by_unknowns + a * size, h, effect, size);
+        if (!moves) continue;
         add(w->weight + a * s, -h, weighted, s);
         for (Index e = 0; e < s; e++) w->weight[e * s + a] -= h * weighted[e];
     }
@@ -649,9 +672,13 @@ SIZED void ends_of(const Measured *of, Work *w, Step *to)
     const Index n3 = 3 * of->robots, s = states(of), q = unknowns(of), size = estimated(of);
     double *spread = w->vector, *effect = w->other, *by = w->by_unknowns;
     for (Index a = 0; a < n3; a++) whitened(w->whitening, size, w->u + a * q, by + a * size);
+    memset(to->ends, 0, sizeof(double) * n3 * n3);
+    for (Index c = 0; c < size; c++) {
+        for (Index a = 0; a < n3; a++) effect[a] = by[a * size + c];
+        for (Index a = 0; a < n3; a++) add(to->ends + a * n3, effect[a], effect, n3);
+    }
     for (Index a = 0; a < n3; a++)
-        for (Index e = 0; e < n3; e++)
-            to->ends[a * n3 + e] = w->p[a * s + e] + dot(by + a * size, by + e * size, size);
+        for (Index e = 0; e < n3; e++) to->ends[a * n3 + e] += w->p[a * s + e];
     for (Index c = size; c < q; c++) {
         solved(w->lower, size, w->information + c * q, spread);
         for (Index a = 0; a < n3; a++) effect[a] = w->u[a * q + c] - dot(w->u + a * q, spread, size);
@@ -669,17 +696,19 @@ SIZED int sized_step(
         double *own = w->information + a * q + a;
         *own += ridge + ridge * *own;
     }
-    if (!cholesky(w->information, q, 0, size, w->lower)) return 0;
+    if (!cholesky(w->information, q, 0, size, w->effect, w->lower)) return 0;
     solved(w->lower, size, w->gradient, to->change);
     inverted(w->lower, size, w->vector, w->whitening, to->inverse);
-    if (!cholesky(to->inverse, size, 0, n3, w->inner)) return 0;
+    completed(w->lower, size, 0, n3, w->vector, to->inverse);
+    if (!cholesky(to->inverse, size, 0, n3, w->effect, w->inner)) return 0;
     substituted(w->inner, n3, to->change, w->vector);
     const double length = sqrt(dot(w->vector, w->vector, n3));
     double of_start = 0.0;
     for (Index a = 0; a < n3; a++) of_start += 2.0 * log(w->inner[a * n3 + a]);
     if (!limited(of, largest, to->change, w, to->limited)) return 0;
     misfits(of, to->change, w, w->misfit);
-    misfits(of, to->limited, w, w->of_limited);
+    if (memcmp(to->change, to->limited, sizeof(double) * size)) misfits(of, to->limited, w, w->of_limited);
+    else memcpy(w->of_limited, w->misfit, sizeof(double) * of->ranges);
     backward(of, walk, w, to);
     double volume = 0.0;
     for (Index j = 0; j < of->ranges; j++) volume += log(w->variance[j]);
@@ -721,6 +750,13 @@ CLONED static int stepping(
     double largest, Work *w, Step *to)
 {
     BY_SIZE(of, sized_step(of, walk, poses, variance, ridge, largest, w, to))
+}
+
+/* Add to the inverse of a step, which is that of the start poses, the columns of all other unknowns. */
+CLONED static void finished(const Measured *of, Work *w, Step *to)
+{
+    const Index size = estimated(of);
+    completed(w->lower, size, 3 * of->robots, size, w->vector, to->inverse);
 }
 
 /* --- weights of ranges ------------------------------------------------------------------------------ */
@@ -1032,6 +1068,7 @@ static void ended(
     const Measured *of, const Weighing *by, Index model, Index final, double last_step, Work *w, Fitted *to)
 {
     const Index count = inliers(of, to->weights);
+    finished(of, w, &to->step);
     double level = noise_level(to->step.numbers[0], count - by->free, by->degrees, 0.0);
     if (by->degrees != 0.0) {
         const double correlation =
@@ -1229,6 +1266,7 @@ int gauss_newton_step(const Measured *of, double *walk, const double *poses, con
     double *space = workspace(of, &w);
     if (!space) return NO_MEMORY;
     const int found = stepping(of, &from, poses, variance, ridge, largest, &w, &to);
+    if (found) finished(of, &w, &to);
     free(space);
     return found;
 }
