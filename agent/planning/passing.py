@@ -24,17 +24,21 @@ from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose
 from protocol.sweep_strips import Place
 
-BLOCKED = 0.1
-"""The way that is left in a tick, as a fraction of A_0, below which a robot may be blocked."""
-
 RESERVE = 0.05
 """The way that robots leave to each other, as a fraction of A_0, but on a way aside.
 
-Without it, two robots come so near that neither has any way left, and both stand there for ever.
+Without it, two robots come so near that neither has any way left, and both stand there for ever. Less is
+needed where they allow for errors of the ranges: most of these are smaller, and leave them some way.
 """
 
 BLOCKED_AFTER = 4
 """The ticks in which so little way does not grow, after which it drives aside."""
+
+BLOCKED_ASIDE_AFTER = 16
+"""The number of such ticks on a way aside after which it leads elsewhere.
+
+With as few as BLOCKED_AFTER, noise of the ranges turns robots to and fro that have hardly begun to back off.
+"""
 
 CLEARANCE = 0.25
 """The distance by which a way aside is longer than needed, as a fraction of R."""
@@ -61,7 +65,7 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
         if drive.way_to(state, passing.places[0], backward=True) is None:
             passing = replace(passing, places=passing.places[1:])
             state = state.with_agenda(passing=passing)
-    waits = is_tight(leeway(before, None, mission), mission)
+    waits = separation.is_tight(leeway(before, None, mission), mission)
     now = passed(passing, state.odometry, drive.controls(state), free, mission, waits=waits)
     if now.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
         now = replace(now, places=now.places[:2])  # what it does next leads past
@@ -70,7 +74,8 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
 
 def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:
     """Return `controls`, as far as other robots let a robot drive, which is on a way aside or not."""
-    reserve = 0.0 if passing.places else RESERVE * mission.first_straight
+    allowed = separation.SHARE_OF_EACH * separation.largest_error(mission)
+    reserve = 0.0 if passing.places else max(0.0, RESERVE * mission.first_straight - allowed)
     return separation.slowed(controls, max(0.0, passing.leeway - reserve), mission)
 
 
@@ -100,11 +105,6 @@ def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> f
     return min(free, default=math.inf)
 
 
-def is_tight(free: float, mission: Mission) -> bool:
-    """Return whether a robot that may drive `free` m in a tick may be blocked."""
-    return free < BLOCKED * mission.first_straight
-
-
 def passed(
     passing: Bypass, here: Pose, controls: Controls, free: float, mission: Mission, *, waits: bool
 ) -> Bypass:
@@ -113,9 +113,9 @@ def passed(
     While this is little and grows, one of two robots drives away from the other. One that is blocked stands
     still first if it `waits` for another one to drive aside.
     """
-    blocked = passing.blocked + (free <= passing.leeway) if is_tight(free, mission) else 0
+    blocked = passing.blocked + (free <= passing.leeway) if separation.is_tight(free, mission) else 0
     yielded = passing.yielded if math.isfinite(free) else 0
-    if blocked < BLOCKED_AFTER or controls.v == 0.0:
+    if blocked < (BLOCKED_ASIDE_AFTER if passing.places else BLOCKED_AFTER) or controls.v == 0.0:
         return replace(passing, leeway=free, blocked=blocked, yielded=yielded)
     if waits and yielded < PATIENCE:
         return replace(passing, leeway=0.0, blocked=blocked, yielded=yielded + 1)

@@ -12,7 +12,7 @@ import math
 
 from msgspec.structs import replace
 
-from agent.planning import drive
+from agent.planning import drive, separation
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
@@ -22,27 +22,46 @@ from protocol.team_motion import next_on_spiral
 
 
 def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoeuvres) -> Searching | None:
-    """Return the task after a tick of `task`, or None once the second range is `measured`."""
+    """Return the task after a tick of `task`, or None once the second range is `measured`.
+
+    A robot that another one blocks, at the safety distance, goes on with the next task.
+    """
     pose, tolerance = state.odometry, state.estimator.pose_tolerance
     distance_tolerance = tolerance * state.config.mission.first_straight
     step = drive.step_length(task.beacon, task.rho0, state.config.mission)
     match task:
         case Straight(beacon, origin, rho0):
-            if travelled(origin, pose) < step - distance_tolerance:
+            is_short = travelled(origin, pose) < step - distance_tolerance
+            if is_short and not _is_blocked(state):
                 return task
-            if measured:
+            if measured and not is_short:
                 return None
             if manoeuvres.backward:
                 return Backing(beacon, origin, rho0)
             return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
         case Backing(beacon, origin, rho0):
-            if relative(origin, pose).x > distance_tolerance - step:
+            is_short = relative(origin, pose).x > distance_tolerance - step
+            if is_short and not _is_blocked(state):
                 return task
-            return None if measured else Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
+            if measured and not is_short:
+                return None
+            return Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
         case Turning(beacon, origin, rho0, heading):
             return task if abs(heading - pose.heading) > tolerance else Circling(beacon, origin, rho0)
         case _:
             return None if measured else task
+
+
+def _is_blocked(state: RobotState) -> bool:
+    """Return whether the robot has hardly moved in the last tick, to keep the safety distance.
+
+    One that drives away from another robot moves farther in each tick.
+    """
+    mission, runs = state.config.mission, state.log.runs
+    last, before = runs[-1], runs[-2].v if len(runs) > 1 else 0.0
+    if not (mission.safety_distance and separation.is_tight(abs(last.v) * mission.period, mission)):
+        return False
+    return last.ticks > 1 or (last.v * before > 0.0 and abs(last.v) <= abs(before))
 
 
 # --- the way back, under noise ------------------------------------------------------------------------

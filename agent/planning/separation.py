@@ -21,12 +21,25 @@ LARGEST_ERROR_SIGMAS = 3.0
 SHARE_OF_EACH = 0.5
 """The share of the remaining distance that each robot may use while the other one may be driving too."""
 
+BLOCKED = 0.1
+"""The way that is left in a tick, as a fraction of A_0, below which a robot may be blocked."""
+
+
+def is_tight(metres: float, mission: Mission) -> bool:
+    """Return whether a robot that may drive so many metres in a tick, or has driven them, may be blocked."""
+    return metres < BLOCKED * mission.first_straight
+
+
+def largest_error(mission: Mission) -> float:
+    """Return the assumed largest error in m of a mutual range."""
+    return LARGEST_ERROR_SIGMAS * mission.noise.mutual_sigma
+
 
 def leeway(rho: float, mission: Mission) -> float:
     """Return how far in m a robot may go in any direction, `rho` m from a peer that stands still."""
     if not mission.safety_distance:
         return math.inf
-    return max(0.0, rho - LARGEST_ERROR_SIGMAS * mission.noise.mutual_sigma - mission.safety_distance)
+    return max(0.0, rho - largest_error(mission) - mission.safety_distance)
 
 
 def leeway_of_each(rho: float, mission: Mission) -> float:

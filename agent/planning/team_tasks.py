@@ -23,7 +23,7 @@ from agent.planning import separation
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.agenda import Bypass
 from agent.planning.drive import pursuit, towards
-from agent.planning.passing import is_tight, limited, passed
+from agent.planning.passing import limited, passed
 from agent.planning.strides import stride
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
 from protocol.messages import Undecided
@@ -71,7 +71,7 @@ def _passing_robots(state: TeamState) -> TeamState:
         passing = replace(passing, places=passing.places[1:])
     controls, waits = (
         _aside(passing, state) or state.controls,
-        any(is_tight(left, mission) for left in before),
+        any(separation.is_tight(left, mission) for left in before),
     )
     return replace(state, passing=passed(passing, here, controls, least, mission, waits=waits))
 
