@@ -129,19 +129,28 @@ def test_all_robots_keep_the_distance_and_are_localised_within_the_bound(
     assert run.end.tick * scenario.mission.period <= scenario.meetings[-1].ends
 
 
-def test_a_robot_on_its_orbit_makes_way_for_one_that_waits_there() -> None:
-    """A hunt found this group: r3 and r1, which wait for others, stopped for each other for ever."""
+BLOCKED = {
+    "on an orbit, by one that waits": (76739130, 4, 30.0, {"sensing_range": 2.1, "period": 0.77}),
+    "in phase 1, by one that drives towards it": (82, 6, 15.0, {}),
+}
+"""Groups in which two robots stopped for each other for ever: seed, robots, spacing and mission."""
+
+
+@pytest.mark.parametrize("name", BLOCKED)
+def test_robots_that_block_each_other_make_way(name: str) -> None:
+    seed, robots, spacing, mission = BLOCKED[name]
     table = {
         "name": "blocked",
-        "seed": 76739130,
+        "seed": seed,
         "mission": {
-            "sensing_range": 2.1,
-            "period": 0.77,
+            "sensing_range": 3.0,
+            "period": 1.0,
             "max_speed": 1.0,
             "max_turn_rate": 3.455751918948773,
             "safety_distance": 0.3,
+            **mission,
         },
-        "group": {"robots": 4, "spacing": 30.0},
+        "group": {"robots": robots, "spacing": spacing},
     }
     run = of_frames(kept(validate(table, "blocked.toml").scenario))
     assert localised(run) == set(run.robots)
