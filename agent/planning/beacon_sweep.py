@@ -66,7 +66,7 @@ def begun(state: RobotState, part: int) -> RobotState:
     return state.doing(Sweeping(transformed(inverse(state.agenda.frame), path)))
 
 
-def passed(state: RobotState, helped: Sequence[str]) -> RobotState:
+def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
     """Return `state` after a tick of a sweep, in which it stops where its own pose is known well enough.
 
     Its verdict is Undecided if that contradicts its claim. The robots `helped` have no anchor.

@@ -26,7 +26,7 @@ class Search(NamedTuple):
     """It adds the pose of the robot to its report to one without an anchor, if it may state it."""
     begun: Callable[[RobotState, int], RobotState]
     """It begins the sweep of a part of the area."""
-    onward: Callable[[RobotState, Sequence[str]], RobotState]
+    after_tick: Callable[[RobotState, Sequence[str]], RobotState]
     """It follows a tick of a sweep; the robots that it names have no anchor, and may be localised."""
     has_beacon: bool
     """True if the robot that was visited last stays where it is, so that the sweeping one knows its pose.
@@ -35,8 +35,10 @@ class Search(NamedTuple):
     """
 
 
-DEAD_RECKONED = Search(Resected(), sweep.told, sweep.begun, sweep.passed, has_beacon=False)
-CORRECTED = Search(Contacted(), beacon_sweep.told, beacon_sweep.begun, beacon_sweep.passed, has_beacon=True)
+DEAD_RECKONED = Search(Resected(), sweep.told, sweep.begun, sweep.after_tick, has_beacon=False)
+CORRECTED = Search(
+    Contacted(), beacon_sweep.told, beacon_sweep.begun, beacon_sweep.after_tick, has_beacon=True
+)
 
 
 def search_of(state: RobotState) -> Search:
@@ -117,4 +119,4 @@ def swept(state: RobotState) -> RobotState:
     Those that are localised do not count, nor those with which a contact has failed.
     """
     helped = [one for one in state.config.unanchored if is_helped(state, one) and not state.other(one).failed]
-    return search_of(state).onward(state, helped)
+    return search_of(state).after_tick(state, helped)

@@ -131,7 +131,7 @@ def begun(state: RobotState, part: int) -> RobotState:
     return along(state, area.strips_of(part, state.config.mission.sensing_range))
 
 
-def passed(state: RobotState, helped: Sequence[str]) -> RobotState:
+def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
     """Return `state` after a tick of a sweep, and stops for those of `helped` that are near."""
     near = [one for one in helped if _is_near(state, one)]
     return moved_on(state, near, partial(looping, state), stops=bool(near), longest=LOOPS_FOR)
