@@ -2,8 +2,9 @@
 
 The visitor of a last meeting sweeps a part of the area. The robot that it has visited stays where it is, and
 is its beacon: before each two strips, the sweeping robot passes its own anchor and its beacon, so that it
-knows its pose again (`own_pose`). Where it comes into range of a robot without an anchor, it reports its pose
-with the covariance, which stay fixed during the contact, and its odometry from then on.
+knows its pose again. Ranges to both are measurements of their meeting like those before its claim. Where it
+comes into range of a robot without an anchor, it reports its pose with the covariance, which stay fixed
+during the contact, and its odometry from then on.
 """
 
 from __future__ import annotations
@@ -11,16 +12,23 @@ from __future__ import annotations
 from collections.abc import Sequence
 from functools import partial
 
-from msgspec.structs import replace
+from msgspec.structs import astuple, replace
 
-from agent.planning import own_pose, sweep
+from agent.estimation.claim import NORMAL_RATIO, Blocked, claim
+from agent.estimation.gaussian.claim_agreement import difference
+from agent.estimation.gaussian.followed_pair import followed_later
+from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.mission_measurements import pair_of
+from agent.estimation.judged import Judged
+from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow
+from agent.planning import sweep
 from agent.planning.agenda import Other
 from agent.planning.state import RobotState
 from agent.planning.sweep import LINGER, ticks_since
-from agent.planning.tasks import Done, Sweeping, transformed
+from agent.planning.tasks import Done, Looping, Sweeping, transformed
 from protocol.messages import Localised, Report, ReportedPose
-from protocol.motion import inverse
-from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, surveyed_path
+from protocol.motion import Covariance, compose, inverse
+from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, Place, surveyed_path
 from protocol.sweep_ticks import contact_ticks
 
 WORTH = 0.9
@@ -28,6 +36,34 @@ WORTH = 0.9
 
 The ranges between them add to it: with a larger one, the other robot can make no claim.
 """
+
+REFIT = 20
+"""The ticks after which the pose is estimated again without further ranges, from the odometry alone."""
+
+REFIT_WITH_RANGES = 3
+"""The ticks after which it is estimated again with further ranges."""
+
+LOST_SIGMA = 0.1
+"""The sigma of the position, in units of R, from which on the next few ranges do not determine it."""
+
+RANGES_AGAIN = 6
+"""The number of further ranges that determine it then.
+
+The two unknowns of the position need ranges from several sides of the anchor or the beacon.
+"""
+
+MOST_WEIGHED = 48
+"""The most ranges of a kind after the claim of the meeting that a fit weighs; those before it all count.
+
+Only in the meeting both robots moved. Without its ranges, the beacon and its mirror image about the line
+between the anchors explain all others, and the pose is ambiguous again.
+
+There are hundreds of ranges to a beacon that stands still, and they give nothing new. With fewer, passages of
+an anchor count less.
+"""
+
+SMALLEST_LOSS = 1e-6
+"""The smallest difference of log-likelihoods by which another one is divided."""
 
 
 def told(state: RobotState, peer: str, report: Report) -> Report:
@@ -60,8 +96,8 @@ def begun(state: RobotState, part: int) -> RobotState:
             peer_state=known.peer_state,
         )
     due = replace(state.agenda.own_pose, estimated_tick=None, reference=None)
-    state = own_pose.updated(state.with_agenda(own_pose=due))
-    anchor, beacon = state.config.anchor, own_pose.beacon_place(state)
+    state = updated(state.with_agenda(own_pose=due))
+    anchor, beacon = state.config.anchor, beacon_place(state)
     path = surveyed_path(config.sweep, part, config.mission.sensing_range, (anchor.x, anchor.y), beacon)
     return state.doing(Sweeping(transformed(inverse(state.agenda.frame), path)))
 
@@ -71,7 +107,7 @@ def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
 
     Its verdict is Undecided if that contradicts its claim. The robots `helped` have no anchor.
     """
-    mission, state = state.config.mission, _with_contact(own_pose.updated(state), helped)
+    mission, state = state.config.mission, _with_contact(updated(state), helped)
     if state.verdict is not None:
         return state
     helped = [one for one in helped if ticks_since(state, one) <= LINGER]
@@ -86,12 +122,12 @@ def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
 def _with_contact(state: RobotState, helped: Sequence[str]) -> RobotState:
     """Return `state` with a reference if a contact has begun in this tick, and without one at its end."""
     ticks = [ticks_since(state, one) for one in helped]
-    searched = state.agenda.own_pose.searched_tick
+    latest = state.agenda.own_pose.searched_tick
     if state.agenda.own_pose.reference is not None:
         return _with_reference(state, None) if all(since > LINGER for since in ticks) else state
-    if 0 not in ticks or (searched is not None and state.tick - searched <= LINGER):
+    if 0 not in ticks or (latest is not None and state.tick - latest <= LINGER):
         return state
-    state, reference = own_pose.searched(state)
+    state, reference = searched(state)
     return _agreed(state, reference) if reference is not None else state
 
 
@@ -107,7 +143,7 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     """
     fix = state.agenda.fix
     assert fix is not None
-    off = own_pose.contradiction(state, Localised(reference.pose, reference.covariance))
+    off = contradiction(state, Localised(reference.pose, reference.covariance))
     if off is None:
         return _with_reference(state, reference)
     if len(fix.peers) > 1:
@@ -131,3 +167,101 @@ def _has_passed(other: Other, tick: int, near: float) -> bool:
         return latest.range <= near
     before = [one.range for one in other.mutual[-2:-1] if one.tick == tick - 1]
     return bool(before) and min(before) <= near and before[0] <= latest.range
+
+
+# --- its pose ---
+
+
+def updated(state: RobotState) -> RobotState:
+    """Return `state` with a new estimate of the pose, if one is due."""
+    before = state.agenda.own_pose.estimated_tick
+    ranged = bool(state.log.ranges) and state.log.ranges[-1].tick == state.tick
+    ranged |= bool(state.mutual) and state.mutual[-1].tick == state.tick
+    if before is not None and state.tick - before < (REFIT_WITH_RANGES if ranged else REFIT):
+        return state
+    return _with_estimate(state, *followed_later("finder", state, _measured(state), searched=False))
+
+
+def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
+    """Return `state` with an estimate from a search of the whole plane, and its pose if it may be reported.
+
+    The conditions are those of `claim`. After a large sigma, the first few ranges leave more than an ellipse
+    describes, so there must be RANGES_AGAIN. If poses many sigmas away are likelier than the ellipse says,
+    the covariance is widened until it says as much, but at most by MOST_WIDENED.
+    """
+    found, judged = followed_later("finder", state, _measured(state), searched=True)
+    state = _with_estimate(state, found, judged)
+    reference = _reference(state, judged)
+    return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
+
+
+def contradiction(state: RobotState, claim: Localised) -> str | None:
+    """Return in words by how much the present `claim` contradicts the known pose; None if it does not.
+
+    The claims of robots with exact sensors have no covariance, and are never wrong.
+    """
+    fix, mission = state.agenda.fix, state.config.mission
+    if fix is None or claim.covariance is None:
+        return None
+    off = difference(fix.claim, fix.known.tick, claim, state.tick, state.log, mission)
+    if off.p_value >= 1.0 - mission.confidence:
+        return None
+    return f"{off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
+
+
+def beacon_place(state: RobotState) -> Place:
+    """Return the most probable position of the beacon in <W>, in m; its anchor if there is no hypothesis."""
+    measured = _measured(state)
+    found = follow(Posterior(PAIR, state.belief.pair), measured).hypotheses
+    if not found:
+        return state.config.peer_anchor.x, state.config.peer_anchor.y
+    x, y, _ = found[0].fit.poses[1 if state.config.role == "a" else 0].tolist()
+    return state.config.m1.x + x, state.config.m1.y + y
+
+
+def _measured(state: RobotState) -> JointMeasurements:
+    """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
+    measured = pair_of(state)
+    claimed = state.agenda.fix.known.tick if state.agenda.fix is not None else -1
+    return measured.thinned_after(claimed, MOST_WEIGHED)
+
+
+def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judged | None) -> RobotState:
+    """Return `state` with an estimate. The places to which the robot drives stay where they are in <W>."""
+    before = state.agenda.own_pose
+    if judged is None:
+        return state.with_agenda(own_pose=replace(before, estimated_tick=state.tick))
+    now = judged.localised
+    assert now.covariance is not None
+    framed = state.with_frame(now.pose)
+    turn, task = compose(inverse(framed.agenda.frame), state.agenda.frame), state.task
+    if isinstance(task, Sweeping):
+        task = Sweeping(transformed(turn, task.places))
+    elif isinstance(task, Looping):
+        task = replace(task, then=transformed(turn, task.then))
+    belief = replace(state.belief, pair=tuple(scored))
+    ranges = len(state.log.ranges) + len(state.mutual)
+    was_lost = before.sigma > LOST_SIGMA * state.config.mission.sensing_range
+    own_pose = replace(
+        before,
+        estimated_tick=state.tick,
+        ranges=ranges,
+        sigma=now.covariance.position_sigma,
+        ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
+    )
+    return replace(framed, belief=belief, task=task).with_agenda(own_pose=own_pose)
+
+
+def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:
+    """Return the pose that was `judged` if the robot may report it (see `searched`); None if not."""
+    own_pose = state.agenda.own_pose
+    if judged is not None and own_pose.ranges_when_lost is not None:
+        required = own_pose.ranges_when_lost + RANGES_AGAIN
+        judged = judged._replace(ranges=own_pose.ranges, required=required)
+    found = claim(judged)
+    if judged is None or isinstance(found, Blocked):
+        return None
+    assert found.covariance is not None
+    factor = max(NORMAL_RATIO / min(judged.rival.log_likelihood_ratio, -SMALLEST_LOSS), 1.0)
+    covariance = Covariance(*[factor * one for one in astuple(found.covariance)])
+    return ReportedPose(state.tick, found.pose, covariance)

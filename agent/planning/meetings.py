@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from agent.planning import appointments, searching, sweep, visit
 from agent.planning.agenda import Fix
-from agent.planning.own_pose import contradiction
+from agent.planning.beacon_sweep import contradiction
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
 from protocol.messages import Localised, Report, Undecided

@@ -57,7 +57,8 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
         return state
     free = leeway(contacts, state.config.peer if state.in_contact else None, mission)
     before = [one for one in contacts if one.peer < state.config.robot]
-    if not _is_on_its_way(state):
+    stays = isinstance(task, Orbiting) and state.config.orbit.v == 0.0
+    if stays or not isinstance(task, Travelling | Orbital):
         return state.with_agenda(passing=Bypass(free, detours=passing.detours))
     if passing.places:  # what it does after the way aside begins where that ends
         on_visit = isinstance(task, Travelling)
@@ -77,19 +78,6 @@ def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:
     allowed = separation.SHARE_OF_EACH * separation.largest_error(mission)
     reserve = 0.0 if passing.places else max(0.0, RESERVE * mission.first_straight - allowed)
     return separation.slowed(controls, max(0.0, passing.leeway - reserve), mission)
-
-
-def _is_on_its_way(state: RobotState) -> bool:
-    """Return whether the robot drives to another one, to its orbit or on it, and goes on with that later."""
-    match state.task:
-        case Travelling():
-            return True
-        case Orbiting() if state.config.orbit.v == 0.0:
-            return False
-        case Orbital():
-            return bool(state.agenda.passing.places) or drive.controls(state).v != 0.0
-        case _:
-            return False
 
 
 def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> float:

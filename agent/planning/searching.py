@@ -17,8 +17,8 @@ from agent.planning.state import RobotState
 from protocol.messages import Localised, Report
 
 
-class Search(NamedTuple):
-    """The search for robots without an anchor, as far as it depends on the sensors: chosen once."""
+class SweepSteps(NamedTuple):
+    """The steps of the search for robots without an anchor that depend on the sensors: chosen once."""
 
     found: Resected | Contacted
     """The knowledge of a robot that is found, before it is."""
@@ -35,14 +35,14 @@ class Search(NamedTuple):
     """
 
 
-DEAD_RECKONED = Search(Resected(), sweep.told, sweep.begun, sweep.after_tick, has_beacon=False)
-CORRECTED = Search(
+DEAD_RECKONED = SweepSteps(Resected(), sweep.told, sweep.begun, sweep.after_tick, has_beacon=False)
+CORRECTED = SweepSteps(
     Contacted(), beacon_sweep.told, beacon_sweep.begun, beacon_sweep.after_tick, has_beacon=True
 )
 
 
-def search_of(state: RobotState) -> Search:
-    """Return the search for the sensors of the mission."""
+def steps_of(state: RobotState) -> SweepSteps:
+    """Return the steps for the sensors of the mission."""
     return CORRECTED if state.estimator.corrects_poses else DEAD_RECKONED
 
 
@@ -63,13 +63,13 @@ def takes_part(state: RobotState) -> bool:
 
     If robots may report false data, its pose is not independent of those that have found it.
     """
-    shares = not (search_of(state).has_beacon or state.config.tolerates)
+    shares = not (steps_of(state).has_beacon or state.config.tolerates)
     return shares and isinstance(state.agenda.robot_verdict, Localised)
 
 
 def has_beacon(state: RobotState) -> bool:
     """Return whether the robot sweeps with its latest peer as a beacon, which goes on to get its log."""
-    return state.sweeps and search_of(state).has_beacon
+    return state.sweeps and steps_of(state).has_beacon
 
 
 def is_apart(state: RobotState) -> bool:
@@ -78,7 +78,7 @@ def is_apart(state: RobotState) -> bool:
     A beacon stays where it is: it sweeps no part, and its planned meetings are over.
     """
     config, agenda = state.config, state.agenda
-    if state.sweeps or config.sweep is None or not search_of(state).has_beacon:
+    if state.sweeps or config.sweep is None or not steps_of(state).has_beacon:
         return state.sweeps
     if config.part < config.sweep.parts or agenda.visits < len(config.visits):
         return False
@@ -94,7 +94,7 @@ def outside_meeting(state: RobotState, peer: str) -> Report:
     report = replace(exchange.report_without_log(state, verdict), strips=sweep.strips(state))
     if not (is_helped(state, peer) and isinstance(verdict, Localised)):
         return report
-    return search_of(state).told(state, peer, report)
+    return steps_of(state).told(state, peer, report)
 
 
 def next_part(state: RobotState) -> RobotState:
@@ -110,7 +110,7 @@ def next_part(state: RobotState) -> RobotState:
     state = state.with_agenda(
         parts=state.agenda.parts + 1, part_tick=state.tick, visiting=False, unmet=0, silence=0
     )
-    return search_of(state).begun(state, part)
+    return steps_of(state).begun(state, part)
 
 
 def swept(state: RobotState) -> RobotState:
@@ -119,4 +119,4 @@ def swept(state: RobotState) -> RobotState:
     Those that are localised do not count, nor those with which a contact has failed.
     """
     helped = [one for one in state.config.unanchored if is_helped(state, one) and not state.other(one).failed]
-    return search_of(state).after_tick(state, helped)
+    return steps_of(state).after_tick(state, helped)

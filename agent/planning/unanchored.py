@@ -38,7 +38,7 @@ class UnanchoredPlanner(LogPlanner):
         state = RobotState(config, task=Awaiting())
         if state.estimator.corrects_poses:
             library()  # it is needed when the robot is found, and would end the mission then
-        return state.with_agenda(found=searching.search_of(state).found, alone=True)
+        return state.with_agenda(found=searching.steps_of(state).found, alone=True)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose.
