@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import subprocess
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -10,7 +11,7 @@ from typing import Any
 import pytest
 from PIL import Image, ImageSequence
 
-from docs import film, peer_tables, peers, picture, rendezvous
+from docs import film, measured, peer_tables, peers, picture, rendezvous
 
 ROOT = Path(__file__).parents[1]
 IMAGE = re.compile(r"!\[[^]]*\]\((?:docs/)?([^)]+)\)")
@@ -91,6 +92,45 @@ def test_a_window_of_the_comparison_measures_what_the_pages_have(
                 assert now.claims == then.claims, stale
             if now.estimator == few[1]:  # one start, which does not lead to the truth
                 assert max(one or 9.0 for one in now.errors_m) > 1.0, stale
+
+
+def test_every_number_of_the_results_is_of_a_measurement_whose_command_and_code_are_recorded() -> None:
+    assert not [*measured.unrecorded(measured.PAGE.read_text("utf-8"), measured.recorded())]
+
+
+def test_a_number_that_changes_without_a_measurement_is_stale() -> None:
+    page = "# Results\n\nAll 10 robots are\nlocalised.\n\nIt takes `x=3` [3 s](there.md#3) or longer.\n"
+    (only,) = measured.paragraphs(page)
+    known = measured.Statement("All 10 robots", "tandem sweep ten", "0000000", measured.hashed(only))
+    assert not [*measured.unrecorded(page, [known])]
+    assert not [*measured.unrecorded(page.replace("are\nlocalised", "are localised"), [known])]
+    (changed,) = measured.unrecorded(page.replace("localised", "localised in 3 ticks"), [known])
+    assert changed == "'All 10 robots' has changed: measure it by `tandem sweep ten`, then use --again"
+    (unknown, gone) = measured.unrecorded(page.replace("All 10", "All 11"), [known])
+    assert unknown.startswith("no command measures 'All 11 robots are")
+    assert gone == "'All 10 robots' is not on the page"
+
+
+def test_a_measurement_says_how_often_the_deciding_code_has_changed_since(tmp_path: Path) -> None:
+    def git(*words: str) -> str:
+        who = ("-c", "user.name=a", "-c", "user.email=a@b.c")
+        return subprocess.run(
+            ["git", *who, *words], cwd=tmp_path, capture_output=True, text=True, check=True
+        ).stdout.strip()
+
+    git("init", "-q")
+    for path in ("agent", "compose"):
+        (tmp_path / path).mkdir()
+        (tmp_path / path / "a.py").write_text("")
+    git("add", ".")
+    git("commit", "-qm", "Begin")
+    commit = git("rev-parse", "HEAD")
+    for path, changes in (("compose", "of today's code"), ("agent", "commits since: 1")):
+        (tmp_path / path / "a.py").write_text("1")
+        git("commit", "-qam", "Change")
+        line = measured.age(measured.Statement("All", "tandem sweep ten", commit, ""), tmp_path)
+        assert line == f"All...: {commit}, {changes}; `tandem sweep ten`"
+    assert measured.changes_since("f" * 40, tmp_path) is None
 
 
 @pytest.mark.long
