@@ -718,16 +718,16 @@ class SurveyedAnchor(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
 
 
 class Estimate(Message, frozen=True):
-    """The poses that a robot considers possible at tick k."""
+    """The hypotheses of a robot at tick k."""
 
     tick: Tick
     """The tick k."""
     robot: RobotId
     """The sender."""
     local: tuple[Pose, ...]
-    """The possible poses in the robot's anchor frame, in a team in that of its start: m, m and rad."""
+    """The hypotheses in the robot's anchor frame, in a team in that of its start: m, m and rad."""
     world: tuple[Pose, ...]
-    """The possible poses in <W>, one for each remaining placement: m, m and rad."""
+    """The hypotheses in <W>: m, m and rad; empty before there are any."""
     localised: bool
     """True if the robot claims its pose."""
     probabilities: tuple[Probability, ...] = ()
@@ -766,7 +766,7 @@ class FinalReport(Message, frozen=True):
     if that of b did not decide."""
     separation_m2: Annotated[float, Meta(ge=0.0, le=1e15)] | None
     """The cost J of eq. (8) for `last_turn_rate`, with squared ranges, in m^2; None if no manoeuvre was
-    planned, or if there was only one candidate."""
+    planned, or if there was only one hypothesis."""
     hypotheses: Count | None
     """The number of remaining hypotheses about the poses of both robots; None if the robots did not meet."""
     probability: Probability | None

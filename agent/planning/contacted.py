@@ -91,7 +91,7 @@ class Contacted(msgspec.Struct, frozen=True):
         return self.failure
 
     def estimate(self, state: RobotState, of_tick: Estimate) -> Estimate:
-        """Return `of_tick` with the possible poses of the latest fit."""
+        """Return `of_tick` with the hypotheses of the latest fit."""
         latest = self.fit
         if latest is None or (self.estimated_tick != state.tick and state.verdict is None):
             return of_tick
@@ -100,7 +100,7 @@ class Contacted(msgspec.Struct, frozen=True):
         )
 
     def summary(self, state: RobotState) -> Summary:
-        """Return the number of possible poses, and what prevents a claim."""
+        """Return the number of hypotheses, and what prevents a claim."""
         latest = self.fit
         if latest is None:
             return Summary(blocking_reason=None if state.verdict is not None else self.failure)

@@ -28,7 +28,7 @@ from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
 from protocol.rounding import SURE
 
 LARGEST_MISFIT = 0.1 * SURE
-"""The largest difference in m between a measured range and the one that a possible pose predicts.
+"""The largest difference in m between a measured range and the one that a hypothesis predicts.
 
 It is far above the rounding errors of the poses of both robots, and far below what a wrong pose predicts.
 """
@@ -100,7 +100,7 @@ class Resected(msgspec.Struct, frozen=True):
         return replace(of_tick, world=tuple(world))
 
     def summary(self, state: RobotState) -> Summary:
-        """Return the number of possible poses."""
+        """Return the number of hypotheses."""
         del state
         return Summary(hypotheses=len(self.possible) or len(self.candidates) or None)
 
@@ -137,7 +137,7 @@ def _resected(state: RobotState, found: Resected) -> tuple[RobotState, Resected]
 
 
 def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[RobotState, Resected]:
-    """Return both with the first possible pose, which follows from the reports of `robot`.
+    """Return both with the first hypothesis, which follows from the reports of `robot`.
 
     It is claimed if as many robots agree on it as are needed for one of them to be honest.
     """

@@ -53,7 +53,7 @@ class UnanchoredPlanner(LogPlanner):
         return _searching(state, reports) if searching.takes_part(state) else state
 
     def estimate(self, state: RobotState) -> Estimate:
-        """Return the possible poses in <W>."""
+        """Return the hypotheses in <W>."""
         localised = isinstance(state.agenda.robot_verdict, Localised)
         return _found(state).estimate(state, replace(super().estimate(state), localised=localised))
 
@@ -73,7 +73,7 @@ class UnanchoredPlanner(LogPlanner):
         return sufficient_mutual_ranges(mission.noise)
 
     def summary(self, state: RobotState) -> Summary:
-        """Return the number of possible poses, and what prevents a claim."""
+        """Return the number of hypotheses, and what prevents a claim."""
         return _found(state).summary(state)
 
 

@@ -55,11 +55,11 @@ def draw(pair: PairRecord, medium: Medium = SCREEN) -> dict[str, Figure | Absent
 
 
 class ManoeuvreView(NamedTuple):
-    """The compared candidates in the moving robot's anchor frame, rotated to put the robot on the x-axis."""
+    """The compared hypotheses in the moving robot's anchor frame, rotated to put the robot on the x-axis."""
 
     mover: Pose
     others: tuple[Pose, ...]
-    """The pose of the other robot for each candidate."""
+    """The pose of the other robot by each hypothesis."""
     spin: float
     """The rotation of the anchor frame, in rad."""
 
@@ -111,7 +111,7 @@ def _title(pair: PairRecord, one: Planned) -> str:
 
 
 def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
-    """Draw the candidate positions of the other robot, the last range, and the bisectors of all pairs."""
+    """Draw the positions of the other robot by each hypothesis, the last range, and the bisectors of all pairs."""
     other, x, y = OTHER[one.plan.question.mover], seen.mover.x, seen.mover.y
     for (i, p), (j, q) in combinations(enumerate(seen.others, start=1), 2):
         apart = travelled(p, q)

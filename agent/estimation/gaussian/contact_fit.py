@@ -66,7 +66,7 @@ def contact_measurements(
 
 
 def estimated(measured: JointMeasurements, mission: Mission) -> ContactEstimate | None:
-    """Return the possible poses of this robot; None if there are too few ranges, or no pose explains them."""
+    """Return the hypotheses of this robot; None if there are too few ranges, or no pose explains them."""
     if len(measured.ranges.rho) < FEWEST_FOR_POSE:
         return None
     found = extended(NO_HYPOTHESES, measured)
