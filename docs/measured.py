@@ -1,4 +1,4 @@
-"""Numbers of results.md that no table states, and the code that was measured: `uv run docs/measured.py`.
+"""Measured numbers that docs/reference.py does not write, and the code measured: `uv run docs/measured.py`.
 
 The script prints each paragraph with numbers, the commit whose code was measured, the number of commits since
 that changed a package on which results depend, and the command that measures it again. With `--check`, its
@@ -21,7 +21,9 @@ from typing import NamedTuple
 from docs.reference import PLACE
 
 DOCS = Path(__file__).parent
-PAGE, RECORD = DOCS / "results.md", DOCS / "measured.toml"
+RECORD = DOCS / "measured.toml"
+RESULTS = "results.md"
+"""The page of which each paragraph with numbers has a statement; of other pages, some have."""
 DECIDING = ("agent", "world", "protocol")
 """The packages on which results depend."""
 NO_NUMBERS = re.compile(r"\[[^]]*\]\([^)]*\)|`[^`]*`|95 % intervals")
@@ -29,8 +31,9 @@ NO_NUMBERS = re.compile(r"\[[^]]*\]\([^)]*\)|`[^`]*`|95 % intervals")
 
 
 class Statement(NamedTuple):
-    """A paragraph or table with measured numbers."""
+    """A paragraph, item of a list, or table with measured numbers."""
 
+    page: str
     begins: str
     """Its first words."""
     command: str
@@ -47,8 +50,8 @@ def hashed(paragraph: str) -> str:
 
 
 def paragraphs(page: str) -> list[str]:
-    """Return the paragraphs and tables of a page with numbers that docs/reference.py does not write."""
-    parts = re.split(r"\n\s*\n", PLACE.sub("", page))
+    """Return the parts of a page with numbers that docs/reference.py does not write."""
+    parts = re.split(r"\n\s*\n|\n(?=- )", PLACE.sub("", page))
     return [
         part
         for part in (one.strip() for one in parts)
@@ -61,18 +64,24 @@ def recorded() -> list[Statement]:
     return [Statement(**one) for one in tomllib.loads(RECORD.read_text("utf-8"))["statement"]]
 
 
-def unrecorded(page: str, known: list[Statement]) -> Iterator[str]:
-    """Yield a line for each paragraph of `page` that is not as recorded, and each statement without one."""
-    there = paragraphs(page)
-    for part in there:
-        statement = next((one for one in known if part.startswith(one.begins)), None)
-        if statement is None:
-            yield f"no command measures {part[:50]!r}: add it to docs/measured.toml"
-        elif hashed(part) != statement.text:
-            yield f"{statement.begins!r} has changed: measure it by `{statement.command}`, then use --again"
+def unrecorded(known: list[Statement], docs: Path = DOCS) -> Iterator[str]:
+    """Yield a line for each paragraph that is not as recorded, and each of RESULTS without a record."""
     for one in known:
-        if not any(part.startswith(one.begins) for part in there):
-            yield f"{one.begins!r} is not on the page"
+        part = paragraph_of(one, docs)
+        if part is None:
+            yield f"{one.page}: no paragraph begins with {one.begins!r}"
+        elif hashed(part) != one.text:
+            yield f"{one.page}: {one.begins!r} has changed: measure it by `{one.command}`, then use --again"
+    begins = tuple(one.begins for one in known if one.page == RESULTS)
+    for part in paragraphs((docs / RESULTS).read_text("utf-8")):
+        if not part.startswith(begins):
+            yield f"{RESULTS}: no command measures {part[:50]!r}: add it to docs/measured.toml"
+
+
+def paragraph_of(statement: Statement, docs: Path = DOCS) -> str | None:
+    """Return the paragraph of a statement; None if there is none."""
+    there = paragraphs((docs / statement.page).read_text("utf-8"))
+    return next((part for part in there if part.startswith(statement.begins)), None)
 
 
 def changes_since(commit: str, repository: Path = DOCS.parent) -> int | None:
@@ -88,7 +97,7 @@ def age(statement: Statement, repository: Path = DOCS.parent) -> str:
     since = (
         "unknown here" if changes is None else f"commits since: {changes}" if changes else "of today's code"
     )
-    return f"{statement.begins}...: {statement.commit}, {since}; `{statement.command}`"
+    return f"{statement.page}: {statement.begins}...: {statement.commit}, {since}; `{statement.command}`"
 
 
 def written(statements: list[Statement]) -> str:
@@ -98,7 +107,11 @@ def written(statements: list[Statement]) -> str:
         for one in statements
     ]
     return "\n\n".join(
-        ["# The numbers of results.md that no table states; docs/measured.py reads it.", *entries, ""]
+        [
+            "# The measured numbers that docs/reference.py does not write; docs/measured.py reads it.",
+            *entries,
+            "",
+        ]
     )
 
 
@@ -108,21 +121,19 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="exit status 1 if a paragraph has changed")
     parser.add_argument("--again", metavar="TEXT", help="record the paragraph that begins so")
     options = parser.parse_args()
-    page, known = PAGE.read_text("utf-8"), recorded()
+    known = recorded()
     if options.again:
         head = subprocess.run(
             ["git", "rev-parse", "--short", "HEAD"], cwd=DOCS, capture_output=True, text=True, check=True
         ).stdout.strip()
-        texts = {
-            one.begins: part for one in known for part in paragraphs(page) if part.startswith(one.begins)
-        }
         chosen = [one for one in known if one.begins.startswith(options.again)]
-        if len(chosen) != 1 or chosen[0].begins not in texts:
+        text = paragraph_of(chosen[0]) if len(chosen) == 1 else None
+        if text is None:
             sys.exit(f"{len(chosen)} statements begin with {options.again!r}")
-        again = chosen[0]._replace(commit=head, text=hashed(texts[chosen[0].begins]))
+        again = chosen[0]._replace(commit=head, text=hashed(text))
         RECORD.write_text(written([again if one is chosen[0] else one for one in known]), "utf-8")
         return
-    problems = list(unrecorded(page, known))
+    problems = list(unrecorded(known))
     for line in problems if options.check else [*map(age, known), *problems]:
         print(line)
     sys.exit(1 if problems else 0)

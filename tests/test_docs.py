@@ -95,20 +95,29 @@ def test_a_window_of_the_comparison_measures_what_the_pages_have(
 
 
 def test_every_number_of_the_results_is_of_a_measurement_whose_command_and_code_are_recorded() -> None:
-    assert not [*measured.unrecorded(measured.PAGE.read_text("utf-8"), measured.recorded())]
+    assert not [*measured.unrecorded(measured.recorded())]
 
 
-def test_a_number_that_changes_without_a_measurement_is_stale() -> None:
-    page = "# Results\n\nAll 10 robots are\nlocalised.\n\nIt takes `x=3` [3 s](there.md#3) or longer.\n"
+def test_a_number_that_changes_without_a_measurement_is_stale(tmp_path: Path) -> None:
+    page = "# Results\n\nAll 10 robots are\nlocalised.\n\n- It takes `x=3` [3 s](there.md#3) or longer.\n"
     (only,) = measured.paragraphs(page)
-    known = measured.Statement("All 10 robots", "tandem sweep ten", "0000000", measured.hashed(only))
-    assert not [*measured.unrecorded(page, [known])]
-    assert not [*measured.unrecorded(page.replace("are\nlocalised", "are localised"), [known])]
-    (changed,) = measured.unrecorded(page.replace("localised", "localised in 3 ticks"), [known])
-    assert changed == "'All 10 robots' has changed: measure it by `tandem sweep ten`, then use --again"
-    (unknown, gone) = measured.unrecorded(page.replace("All 10", "All 11"), [known])
-    assert unknown.startswith("no command measures 'All 11 robots are")
-    assert gone == "'All 10 robots' is not on the page"
+    known = measured.Statement(
+        "results.md", "All 10 robots", "tandem sweep ten", "0000000", measured.hashed(only)
+    )
+
+    def problems(before: str, after: str) -> list[str]:
+        (tmp_path / "results.md").write_text(page.replace(before, after))
+        return [*measured.unrecorded([known], tmp_path)]
+
+    assert not problems("", "")
+    assert not problems("are\nlocalised", "are localised")
+    (changed,) = problems("localised", "localised in 3 ticks")
+    assert changed.endswith("'All 10 robots' has changed: measure it by `tandem sweep ten`, then use --again")
+    (added,) = problems("or longer", "or 4 s")
+    assert added.startswith("results.md: no command measures '- It takes")
+    (gone, unknown) = problems("All 10", "All 11")
+    assert gone == "results.md: no paragraph begins with 'All 10 robots'"
+    assert unknown.startswith("results.md: no command measures 'All 11 robots are")
 
 
 def test_a_measurement_says_how_often_the_deciding_code_has_changed_since(tmp_path: Path) -> None:
@@ -128,8 +137,8 @@ def test_a_measurement_says_how_often_the_deciding_code_has_changed_since(tmp_pa
     for path, changes in (("compose", "of today's code"), ("agent", "commits since: 1")):
         (tmp_path / path / "a.py").write_text("1")
         git("commit", "-qam", "Change")
-        line = measured.age(measured.Statement("All", "tandem sweep ten", commit, ""), tmp_path)
-        assert line == f"All...: {commit}, {changes}; `tandem sweep ten`"
+        line = measured.age(measured.Statement("results.md", "All", "tandem sweep ten", commit, ""), tmp_path)
+        assert line == f"results.md: All...: {commit}, {changes}; `tandem sweep ten`"
     assert measured.changes_since("f" * 40, tmp_path) is None
 
 

@@ -111,7 +111,7 @@ def _title(pair: PairRecord, one: Planned) -> str:
 
 
 def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
-    """Draw the positions of the other robot by each hypothesis, the last range, and the bisectors of all pairs."""
+    """Draw where each hypothesis has the other robot, the last range, and the bisectors of all pairs."""
     other, x, y = OTHER[one.plan.question.mover], seen.mover.x, seen.mover.y
     for (i, p), (j, q) in combinations(enumerate(seen.others, start=1), 2):
         apart = travelled(p, q)
