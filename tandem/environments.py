@@ -15,7 +15,7 @@ from agent.estimation.following import RETESTED, ClaimRule, Following
 from agent.estimation.judged import FEWEST_FOR_CLAIM
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, Ranging, TeamLog
-from compose.errors import UserError
+from compose.errors import UserError, no_such
 from protocol.messages import Command, Localised, Observation, RobotConfig, Team, TeamAnchor
 from protocol.motion import ORIGIN, REST, Controls, step, wrap
 from tandem.scenarios import Scenario
@@ -93,10 +93,13 @@ class MissionEnvironment(ParallelEnv[str, Array, Array]):  # type: ignore[misc] 
     def step(self, actions: Mapping[str, ArrayLike]) -> Stepped:
         """Move all robots for a tick, and return what they observe then; a robot without an action rests.
 
-        Raises UserError for an action that is not (v, omega), and outside a mission.
+        Raises UserError for an action that is not (v, omega) or of no robot, and outside a mission.
         """
         if not (robots := self.agents):
             raise UserError("the mission has not begun, or is over: call reset()")
+        for robot in actions:
+            if robot not in robots:
+                raise UserError(f"actions: {no_such(str(robot), robots)}")
         driven = {robot: _controls(robot, actions[robot]) if robot in actions else REST for robot in robots}
         self.world = self.world._advanced(self._commands(driven))
         seen = self._sensed()

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 from agent.estimation.following import ClaimRule
-from compose.errors import UserError, writing
+from compose.errors import UserError, no_such, writing
 from compose.extras import need
 from compose.launch.class_loader import GuardedSolver
 from compose.recording.estimating.estimate_rows import EstimateSummary, PoseEstimateRow
@@ -72,9 +72,12 @@ class PoseEstimates(msgspec.Struct, frozen=True, dict=True, eq=False):
     def plot(self, kind: Literal["path", "over-time"] = "path") -> Figure:
         """Return one figure: the estimated and true paths from above, or errors and sigmas over time.
 
-        Raises UserError like `figures`.
+        Raises UserError like `figures`, and if there is none of this kind.
         """
-        return self.figures()[f"estimate-{kind}"]
+        figures = {name.removeprefix("estimate-"): one for name, one in self.figures().items()}
+        if kind not in figures:
+            raise UserError(no_such(kind, figures, what="figure "))
+        return figures[kind]
 
     def save(self, folder: str | Path) -> Path:
         """Write `estimate.csv` and `estimate.json` to `folder`, and return its path. Raises UserError."""

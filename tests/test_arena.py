@@ -72,6 +72,11 @@ def test_python_gives_the_same_table_and_the_trials_are_those_of_each_planner_al
     assert noisy["nees_low"] < noisy["nees"] < noisy["nees_high"]
 
 
+def test_an_arena_of_no_missions_is_refused() -> None:
+    with pytest.raises(tandem.UserError, match=r"^noisy: trials: expected a whole number >= 1$"):
+        tandem.arena("assured", trials=0)
+
+
 @pytest.mark.parametrize(
     ("words", "says"),
     [

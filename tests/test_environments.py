@@ -92,6 +92,13 @@ def test_an_action_that_is_none_is_refused_in_one_line(action: Any) -> None:
         env.step({"a": (0.0, 0.0), "b": action})
 
 
+def test_an_action_of_no_robot_is_refused_with_the_robots_that_there_are() -> None:
+    env = tandem.parallel_env("random")
+    env.reset()
+    with pytest.raises(tandem.UserError, match=r"^actions: there is no 'c'; there are a, b"):
+        env.step({"c": (0.0, 0.0)})
+
+
 @pytest.mark.long
 @pytest.mark.parametrize("scenario", ["random", "noisy", "room", "group-8"])
 def test_a_step_without_an_estimate_takes_little_more_than_that_of_the_world(scenario: str) -> None:

@@ -477,6 +477,8 @@ def test_estimates_are_those_of_the_command(tmp_path: Path) -> None:
     assert found.rows.columns == PoseEstimateRow.__struct_fields__
     for name, figure in found.figures().items():
         assert names_in(found.plot(name.removeprefix("estimate-"))) == names_in(figure)  # type: ignore[arg-type]
+    with pytest.raises(tandem.UserError, match=r"^there is no figure 'paths'; .*; did you mean 'path'\?$"):
+        found.plot("paths")  # type: ignore[arg-type]
     assert {*found.figures()} == {path.stem for path in (tmp_path / "found").glob("*.svg")}
     assert "<td>A</td>" in found._repr_html_()
 

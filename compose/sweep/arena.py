@@ -47,7 +47,7 @@ def sweeps(
     """Return a sweep over `planners` for each scenario, given by name and table. Raises UserError."""
     rows = [{"label": one, "set": {"planner": {"name": one}}} for one in planners or BASELINES]
     axis = {"name": "planners", "rows": rows, "paired": True}
-    numbers = {"trials": trials or TRIALS, "seed": seed or 0}
+    numbers = {"trials": TRIALS if trials is None else trials, "seed": seed or 0}
     found: dict[str, Sweep] = {}
     for name, base in scenarios:
         if name in found:
