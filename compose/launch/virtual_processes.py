@@ -15,7 +15,6 @@ import random
 import threading
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from functools import partial
 from itertools import count
 from pathlib import Path
 from types import MappingProxyType, SimpleNamespace
@@ -55,6 +54,8 @@ VIRTUAL_TIMEOUT_S = 30.0
 
 DRIVER = "driver of "
 """The beginning of the name of a driver's process in hardware mode."""
+MOST_ARRIVALS = 4
+"""The number of frames between two Commands whose order is noted."""
 LEAST_WAIT_S = 1e-6
 """The least wait in s, so that rounding cannot make one without an end."""
 
@@ -197,6 +198,8 @@ class VirtualNetwork:
         self.failures: list[str] = []
         """The errors with which processes ended, in their order."""
         self.ended: list[str] = []
+        self.orders: set[str] = set()
+        """The orders in which frames have arrived at an agent between two of its Commands."""
         self.subscribers: list[tuple[VirtualLink, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
         self.watchers: list[tuple[VirtualLink, zenoh.KeyExpr, Callable[[_Sample], None]]] = []
         self.tokens: list[tuple[VirtualLink, str]] = []
@@ -272,6 +275,10 @@ class VirtualNetwork:
 
         def arrive() -> None:
             if link.process.link is link:
+                if len(link.arrivals) < MOST_ARRIVALS:
+                    link.arrivals.append(
+                        "report" if "/to/" in sample.key_expr else sample.key_expr.rpartition("/")[2]
+                    )
                 to(sample)
                 self._woken[link.process] = None
 
@@ -311,12 +318,21 @@ class VirtualLink:
 
     def __init__(self, network: VirtualNetwork, process: VirtualProcess) -> None:
         self._network, self.process = network, process
+        self.arrivals: list[str] = []
+        """The kinds of the first frames since the latest Command."""
         self.info = SimpleNamespace(routers_zid=tuple)
 
     def declare_publisher(self, key: str, **_: object) -> SimpleNamespace:
         """Return a publisher on `key`."""
+
+        def put(frame: bytes) -> None:
+            if key.endswith("/command"):
+                self._network.orders.add(", ".join(self.arrivals))
+                self.arrivals.clear()
+            self._network.send(key, frame)
+
         return SimpleNamespace(
-            put=partial(self._network.send, key),
+            put=put,
             declare_matching_listener=_ignored,
             matching_status=SimpleNamespace(matching=False),
         )

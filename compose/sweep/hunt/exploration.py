@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import math
 import multiprocessing
 import random
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence, Set
 from contextlib import contextmanager, redirect_stderr
 from io import StringIO
 from itertools import count
@@ -16,7 +18,7 @@ from compose.launch.supervisor import ChildFailed
 from compose.sweep.hunt import coverage
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
-from compose.sweep.hunt.mutation import WITHIN_BOUNDS, Clues, Table, is_noisy, mutated, seeds, simpler
+from compose.sweep.hunt.mutation import WITHIN_BOUNDS, Clues, Table, is_noisy, joined, mutated, seeds, simpler
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
@@ -27,16 +29,19 @@ MOST_TRIES = 100
 """The number of runs in which an input is shrunk at most."""
 PROCESSES_EACH = 100
 """The number of runs after which an input with kills also runs as processes."""
-NEWEST = 32
-"""The number of the latest inputs of the corpus, of which every second input is a mutation."""
+JOINED_SHARE = 0.15
+"""The share of inputs that get a part of another input before they are changed."""
 SLOWEST_SHARE = 0.2
-"""The share of inputs that are changes of those that came nearest to a computed bound."""
+"""The share of inputs that are changes of those that came nearest to a computed bound.
+
+If their runs take longer than others, it is the share of the time.
+"""
 NEARER = 8
 """The power of the share of its bound by which such an input is chosen: the slowest runs take longest."""
-NOISY_SLOWER = 5.0
+NOISY_SLOWER = 8.0
 """The time of a run with noisy sensors, relative to one with exact sensors that lasts as many ticks.
 
-It was 4 in groups of four and 7 in pairs; most of the time of exact sensors is that of the second run.
+It was 8 in pairs (65 ms), of which few run a second time.
 """
 LONG_TICKS = 300
 """The ticks from which on most of the time grows with the square of the ticks.
@@ -50,6 +55,7 @@ class CorpusEntry(NamedTuple):
 
     table: Table
     known: Clues
+    reached: frozenset[str] = frozenset()
 
     @property
     def share(self) -> float:
@@ -78,10 +84,14 @@ class Hunt:
         self._seed, self._workers, self._guided = seed, workers, guided
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
+        self._energies: list[float] = []
+        """The frequencies of changes of these inputs."""
+        self._usual = 1.0
+        """The `share` of an input whose run takes the mean time of their changes."""
         self.slowest: dict[tuple[int, int], tuple[float, CorpusEntry]] = {}
         """The inputs whose runs used most of a bound, with the share, by the number of bounds and place."""
-        self.seen: set[str] = set()
-        """The states that the runs have reached."""
+        self.seen = Counter[str]()
+        """The states that the runs have reached, with the number of runs that reached each."""
         self.runs = self.processes = self.refused = 0
         """The numbers of inputs, of those that also ran as processes, and of those that have no result."""
 
@@ -93,7 +103,7 @@ class Hunt:
         with _pool(self._workers) as examine:
             for number in count():
                 inputs = self._batch(number)
-                for table, result in zip(inputs, examine(inputs, True), strict=True):
+                for table, result in zip(inputs, examine(inputs, self.seen.keys()), strict=True):
                     self.runs += 1
                     self.refused += result.refused is not None
                     if result.breaches:
@@ -107,6 +117,12 @@ class Hunt:
         """Return the inputs of batch `number`: one of the seeds, many of which are slow, and mutations."""
         left = self.seeds[number : number + 1]
         draw = random.Random(f"{self._seed}/hunt/{number}")
+        self._energies = [
+            one.share / math.sqrt(min([self.seen[state] for state in one.reached])) for one in self.corpus
+        ]
+        if self.corpus:
+            times = [energy / one.share for energy, one in zip(self._energies, self.corpus, strict=True)]
+            self._usual = sum(self._energies) / sum(times)
         return [*left, *[self._input(draw) for _ in range(BATCH - len(left))]]
 
     def _input(self, draw: random.Random) -> Table:
@@ -115,23 +131,24 @@ class Hunt:
             one = self.seeds[0] if self._guided else draw.choice(self.seeds)
             known = Clues(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
             return mutated(one, known, draw)
-        if self.slowest and draw.random() < SLOWEST_SHARE:
+        if self.slowest:
             near = [*self.slowest.values()]
             [(_, entry)] = draw.choices(near, [share**NEARER * one.share for share, one in near])
-            return mutated(entry.table, entry.known, draw, WITHIN_BOUNDS)
-        some = self.corpus[-NEWEST:] if draw.random() < 0.5 else self.corpus
-        [entry] = draw.choices(some, [one.share for one in some])
-        return mutated(entry.table, entry.known, draw)
+            if draw.random() < SLOWEST_SHARE * min(1.0, entry.share / self._usual):
+                return mutated(entry.table, entry.known, draw, WITHIN_BOUNDS)
+        entry, other = draw.choices(self.corpus, self._energies, k=2)
+        table = joined(entry.table, other.table, draw) if draw.random() < JOINED_SHARE else entry.table
+        return mutated(table, entry.known, draw)
 
     def _keep(self, table: Table, result: Examined) -> None:
-        new = result.reached - self.seen
-        self.seen |= new
-        if new:
-            self.corpus.append(CorpusEntry(table, result.known))
+        entry = CorpusEntry(table, result.known, result.reached)
+        if not result.reached <= self.seen.keys():
+            self.corpus.append(entry)
+        self.seen.update(result.reached)
         for place, share in enumerate(result.bound_shares):
             which = len(result.bound_shares), place
             if share > self.slowest.get(which, (0.0, None))[0]:
-                self.slowest[which] = share, CorpusEntry(table, result.known)
+                self.slowest[which] = share, entry
 
     def _shrunk(self, table: Table, breach: Breach, examine: Examine) -> FoundBreach:
         """Return the input nearest to the source with the same breach, as far as MOST_TRIES runs show."""
@@ -139,7 +156,7 @@ class Hunt:
         while left and tries < MOST_TRIES:
             size = min(self._workers, MOST_TRIES - tries)
             tried, left = left[:size], left[size:]
-            for smaller, result in zip(tried, examine(tried, False), strict=True):
+            for smaller, result in zip(tried, examine(tried, None), strict=True):
                 tries += result.refused is None
                 same = next((one for one in result.breaches if one.kind == breach.kind), None)
                 if same is not None:
@@ -167,7 +184,7 @@ class Hunt:
         return None
 
 
-Examine = Callable[[Sequence[Table], bool], Iterator[Examined]]
+Examine = Callable[[Sequence[Table], Set[str] | None], Iterator[Examined]]
 
 
 @contextmanager
@@ -175,8 +192,9 @@ def _pool(workers: int) -> Iterator[Examine]:
     """Yield a function that examines inputs in `workers` processes, forked from this one, in their order."""
     pool = multiprocessing.get_context("fork").Pool(workers, _begin)
 
-    def examine(tables: Sequence[Table], sparing: bool) -> Iterator[Examined]:
-        for one in [pool.apply_async(examined, (table,), {"sparing": sparing}) for table in tables]:
+    def examine(tables: Sequence[Table], seen: Set[str] | None) -> Iterator[Examined]:
+        known = frozenset(seen) if seen is not None else None
+        for one in [pool.apply_async(examined, (table, known)) for table in tables]:
             try:
                 yield one.get(HANG_S)
             except multiprocessing.TimeoutError:

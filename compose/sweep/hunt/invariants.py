@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from agent.estimation.claim import is_definite
-from compose.audit import agent_rules, journal_rules, rules
+from compose.audit import agent_rules, journal_rules, rules, scenario_rules
 from compose.recording.group_localisation import meeting_results, search_results
 from compose.recording.run import Run
 from compose.sweep.trial import Trial, row
@@ -34,15 +34,18 @@ class Breach(msgspec.Struct, frozen=True):
     """The finding, and its place."""
 
 
-def breaches(run: Run, *, replayed: bool) -> Iterator[Breach]:
+def breaches(run: Run, *, in_full: bool, replayed: bool) -> Iterator[Breach]:
     """Yield the invariants that do not hold in `run`, the rules of the audit included.
 
-    `replayed` leaves out the rule `decision`: a second run of the same input has given the same bytes, or is
-    spared. The rule `order` would report that the journals of a run that is cut break off.
+    The rules `decision` and `scenario`, which take longer than all others, are left out unless the run is
+    examined `in_full`; the first one, too, if it was `replayed`: a second run has given the same bytes. The
+    rule `order` would report that the journals of a run that is cut break off.
     """
     applied = list(rules.AUDIT_RULES)
-    if replayed:
+    if replayed or not in_full:
         applied.remove(agent_rules.decision)
+    if not in_full:
+        applied.remove(scenario_rules.scenario)
     if run.end is None:
         applied.remove(journal_rules.order)
     for one in rules.audit_run(run, applied).violations:

@@ -79,14 +79,39 @@ def is_noisy(table: Mapping[str, Any]) -> bool:
 def mutated(
     table: Mapping[str, Any], known: Clues, draw: random.Random, changes: Mapping[Change, float] | None = None
 ) -> Table:
-    """Return `table` with one to three of `changes`, or of all."""
+    """Return `table` with one to three of `changes`, or of all.
+
+    In half of the cases noisy sensors draw other noise, too: the same noise mostly gives the same again.
+    """
     found, weights = copy.deepcopy(dict(table)), changes or MUTATIONS
+    if is_noisy(found) and draw.random() < 0.5:
+        found["seed"] = draw.getrandbits(31)
     for _ in range(draw.choice((1, 1, 2, 3))):
         changed = None
         while changed is None:  # a change that has nothing to change would run the same input again
             [change] = draw.choices(list(weights), list(weights.values()))
             changed = change(copy.deepcopy(found), known, draw)
         found = changed
+    return found
+
+
+def joined(table: Table, other: Table, draw: random.Random) -> Table:
+    """Return `table` with some of what `other` has: faults, kills, an attack, a death or noise.
+
+    Both must have robots of the same names.
+    """
+    if [one["id"] for one in table.get("robot", [])] != [one["id"] for one in other.get("robot", [])]:
+        return table
+    found = copy.deepcopy(dict(table))
+    for name in draw.sample(PARTS, 2):
+        if name in LISTS and other.get(name):
+            found[name] = other[name]
+        elif name in other.get("group", {}) and "group" in found:
+            found["group"][name] = other["group"][name]
+        elif name == "noise" and is_noisy(other):
+            found["mission"] |= {
+                one: other["mission"][one] for one in (name, "accuracy") if one in other["mission"]
+            }
     return found
 
 
@@ -359,6 +384,8 @@ def _nearer(rows: Sequence[Any], others: Sequence[Any]) -> Iterator[list[Any]]:
 
 LISTS = ("clock", "fault", "kill")
 """The lists of a scenario file whose rows are in no order."""
+PARTS = ("fault", "kill", "attack", "dies", "noise")
+"""The parts of an input that it may get from another one."""
 
 
 def fault_lines(table: Mapping[str, Any], source: Mapping[str, Any]) -> int:
