@@ -3,18 +3,21 @@
 from __future__ import annotations
 
 import math
+import random
 import signal
 import tomllib
 from collections.abc import Callable
-from itertools import zip_longest
+from itertools import count, zip_longest
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from agent.estimation import claim
 from agent.planning import phase3_last_manoeuvre
+from agent.planning.paper import Paper
 from agent.process.node import AgentProcess
 from compose.audit import rules
 from compose.cli import hunt as command
@@ -30,7 +33,7 @@ from compose.sweep.cells import cells
 from compose.sweep.hunt import coverage, examination
 from compose.sweep.hunt.examination import MOST_TICKS, MOST_WITHOUT_END, examined, scenario_of, watched
 from compose.sweep.hunt.exploration import Hunt
-from compose.sweep.hunt.mutation import fault_lines, simpler
+from compose.sweep.hunt.mutation import fault_lines, joined, simpler
 from compose.sweep.hunt.mutation import seeds as hunted
 from protocol.journal.journal_file import CorruptJournal, MemoryJournal, packed
 from protocol.messages import Observation
@@ -96,6 +99,86 @@ def test_an_input_is_examined_and_a_defect_is_named(monkeypatch: pytest.MonkeyPa
     monkeypatch.setattr(AgentProcess, "_on_observation", steps_twice(AgentProcess._on_observation))
     assert [one.kind for one in examined(table).breaches][:1] == ["the recording differs"]
     assert examined({**table, "seed": -1}).refused is not None
+
+
+@pytest.fixture
+def second_runs(monkeypatch: pytest.MonkeyPatch) -> list[bool]:
+    """Return a list to which each run as virtual processes adds an item."""
+    runs: list[bool] = []
+    again = examination._again
+
+    def counted(*given: Any) -> Any:
+        runs.append(True)
+        return again(*given)
+
+    monkeypatch.setattr(examination, "_again", counted)
+    monkeypatch.setattr(examination, "FULL_EACH", 2**40)
+    return runs
+
+
+def test_an_input_runs_twice_if_its_kills_or_faults_reach_something_new(second_runs: list[bool]) -> None:
+    table = scenario_table("paper-1")
+    killed = {**table, "kill": [{"who": "b", "tick": 3, "point": "observation"}]}
+    elsewhere = {**table, "kill": [{"who": "b", "tick": 40, "point": "observation"}]}
+    late = {**table, "fault": [{"delay": [1, 1]}]}
+    seen: set[str] = set()
+    for one, runs in ((table, 0), (killed, 1), (killed, 1), (elsewhere, 2), (late, 3), (late, 3)):
+        result = examined(one, seen)
+        assert (result.breaches, len(second_runs)) == ((), runs)
+        seen |= result.reached
+    assert "arrived: observation" in seen
+    assert any(one.endswith(": late") for one in seen)
+    examined(late)  # while an input is shrunk, always
+    assert len(second_runs) == 4
+
+
+@pytest.mark.parametrize("rule", ["decision", "scenario"])
+def test_an_input_without_faults_that_reaches_something_new_is_replayed(
+    rule: str, second_runs: list[bool], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    applied: list[str] = []
+    audit = rules.audit_run
+
+    def noted(run: Any, chosen: Any) -> Any:
+        applied.extend([one.__name__ for one in chosen])
+        return audit(run, chosen)
+
+    monkeypatch.setattr(rules, "audit_run", noted)
+    seen = examined(scenario_table("paper-1"), set()).reached
+    assert (rule in applied, second_runs) == (True, [])
+    applied.clear()
+    examined(scenario_table("paper-1"), seen)
+    assert ("claim" in applied, rule in applied) == (True, False)
+
+
+def test_a_decision_that_differs_on_the_same_inputs_is_found_in_a_single_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    number, real = count(), Paper.command
+
+    def drifting(self: Paper, state: Any) -> Any:
+        command = real(self, state)
+        return replace(command, v=command.v * (1.0 - 1e-9 * next(number)))
+
+    monkeypatch.setattr(Paper, "command", drifting)
+    found = [one.kind for one in examined(scenario_table("paper-1"), set()).breaches]
+    assert found == ["a decision differs"]
+
+
+def test_an_input_gets_faults_and_kills_of_another_one() -> None:
+    table = scenario_table("random")
+    other = {**table, "fault": [{"loss": 0.5}], "kill": [{"who": "a", "tick": 3}]}
+    other["mission"] = {
+        **table["mission"],
+        "noise": {"anchor_sigma": 0.05, "mutual_sigma": 0.05},
+        "accuracy": 0.3,
+    }
+    draw = random.Random(1)
+    made = [joined(table, other, draw) for _ in range(50)]
+    assert {len(one.get("fault", [])) + 2 * len(one.get("kill", [])) for one in made} == {0, 1, 2, 3}
+    assert {one["mission"].get("accuracy") for one in made} == {None, 0.3}
+    assert "noise" not in table["mission"]
+    assert joined(table, scenario_table("noisy") | {"robot": []}, draw) is table
 
 
 def test_an_input_reaches_the_same_after_another_one(monkeypatch: pytest.MonkeyPatch) -> None:

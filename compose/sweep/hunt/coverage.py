@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Set
 from typing import Any, get_args
 
 from agent.estimation import claim
@@ -146,7 +146,7 @@ def _messages(observation: Observation, reports: list[Report], heard: set[tuple[
         heard.add(identity)
 
 
-def never(reached: set[str]) -> dict[str, list[str]]:
+def never(reached: Set[str]) -> dict[str, list[str]]:
     """Return the tasks, conditions and kinds of messages of missions that are not among `reached`."""
     named = {one.partition("/")[0] for one in reached}
     conditions = {one.partition("withheld: ")[2] for one in reached}
