@@ -1,8 +1,9 @@
-"""Defects that a hunt must find: `python -m tests.mutants [NAME ...] [--cpu S]`.
+"""Defects that a hunt must find: `python -m tests.mutants [NAME ...] [--cpu S] [--write]`.
 
 Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used S
 seconds of processor time: with the guide, and beside it by chance alone. A table says after how many runs and
-seconds, with those of shrinking the input, each was found, and how small the input is.
+seconds, with those of shrinking the input, each was found, and how small the input is. `--write` replaces the
+table in docs/howto-hunt.md.
 """
 
 from __future__ import annotations
@@ -37,6 +38,10 @@ MISSED = "not in "
 """The beginning of the result of a hunt that has not found the defect."""
 BUDGET_S = 600.0
 """The processor time in s of 5 minutes on two cores."""
+PAGE = Path("docs/howto-hunt.md")
+"""The page with the table."""
+BEGIN, END = "<!-- written by tests/mutants.py -->", "<!-- end of mutants -->"
+"""The lines around the table."""
 
 
 def edited(owner: Any, name: str, old: str, new: str) -> None:
@@ -205,25 +210,38 @@ def hunted(mutant: Callable[[], None], source: str, cpu_s: float, *, guided: boo
     return f"run {found.runs}, {used():.0f} s: {found.breach.kind}, {changes} changes"
 
 
+def write(rows: list[str], cpu_s: float) -> None:
+    """Replace the table of PAGE by `rows`, with the processor time of each hunt."""
+    before, _, rest = PAGE.read_text().partition(BEGIN)
+    _, _, after = rest.partition(END)
+    told = f"At most {cpu_s:g} s of one core for each hunt, at `--seed 1`; seconds are those of the core:"
+    PAGE.write_text(f"{before}{BEGIN}\n\n{told}\n\n" + "\n".join(rows) + f"\n\n{END}{after}")
+
+
 def main(arguments: list[str]) -> int:
     """Hunt the mutants, and return 0 if the guide has found at least nine of ten of them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("name", nargs="*")
     parser.add_argument("--cpu", type=float, default=BUDGET_S)
     parser.add_argument("--guided-only", action="store_true")
+    parser.add_argument("--write", action="store_true", help="write the table to docs/howto-hunt.md")
     options = parser.parse_args(arguments)
     chosen = [one for one in MUTANTS if one.__name__ in (options.name or _names())]
     missed = 0
-    print("| mutant | guided | by chance |\n| --- | --- | --- |")
+    rows = ["| mutant | guided | by chance |", "| --- | --- | --- |"]
+    print(*rows, sep="\n")
     for mutant in chosen:
-        print(f"| {mutant.__name__}", end="", flush=True)
+        cells = [mutant.__name__]
         for guided in (True,) if options.guided_only else (True, False):
             with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as process:
                 hunt = process.submit(hunted, mutant, MUTANTS[mutant], options.cpu, guided=guided)
                 says = hunt.result()
             missed += guided and says.startswith(MISSED)
-            print(f" | {says}", end="", flush=True)
-        print(" |", flush=True)
+            cells.append(says)
+        rows.append(f"| {' | '.join(cells)} |")
+        print(rows[-1], flush=True)
+        if options.write:
+            write(rows, options.cpu)
     return 0 if 10 * missed <= len(chosen) else 1
 
 
