@@ -41,7 +41,7 @@
     pen.anchor([0, 0], "M1");
     pen.line([start, one], "a"), pen.line([start, other], "a dashed");
     pen.dot(start, "a"), pen.dot(one, "a"), pen.dot(other, "a");
-    pen.text(one, "+α"), pen.text(other, "−α");
+    pen.text(one, "+α"), pen.text(add(other, [0, -0.6]), "−α");
     return `Distances ${metres(apart(start, [0, 0]))} and ${metres(apart(one, [0, 0]))}: both paths have them.`;
   }
 
@@ -109,7 +109,7 @@
     scene(pen, omega);
     pen.line(RATES.map((rate) => [x(rate), y(separation(rate))]), "faint"), pen.line([[x(-Math.PI), y(0)], [x(Math.PI), y(0)]], "range");
     pen.dot([x(BEST), y(most)], "b"), pen.dot([x(omega), y(separation(omega))], "a");
-    pen.text([x(-Math.PI), y(0) - 0.9], "J over ω, −π to π rad/s");
+    pen.text([x(-Math.PI), y(0) - 1.15], "J over ω, −π to π rad/s");
     return `ω = ${omega.toFixed(2)} rad/s: J = ${separation(omega).toFixed(2)} m²; the best is ${most.toFixed(2)} m² at ${BEST.toFixed(2)} rad/s.`;
   }
 

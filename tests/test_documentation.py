@@ -22,7 +22,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import pytest
-from playwright.sync_api import Browser
+from playwright.sync_api import Browser, expect
 
 from compose import errors
 from compose.audit import rules
@@ -30,6 +30,7 @@ from compose.cli import commands, main
 from compose.figures import PICTURES
 from compose.launch.processes import free_endpoint
 from docs import constraints, reference
+from tests.browser import until_shown
 from tests.commands import OVER, Ended, TandemProcess, tandem
 from tests.series import series
 
@@ -329,7 +330,7 @@ def test_the_site_is_built_without_a_warning_and_loads_nothing_from_other_hosts(
 
 
 @pytest.mark.long
-def test_the_figures_of_the_method_follow_their_sliders_and_no_page_is_wider_than_a_telephone(
+def test_figures_follow_their_sliders_no_page_is_wider_than_a_telephone_and_missions_are_played(
     site: Path, browser: Browser
 ) -> None:
     page = browser.new_page(viewport={"width": 390, "height": 844})
@@ -346,6 +347,11 @@ def test_the_figures_of_the_method_follow_their_sliders_and_no_page_is_wider_tha
     for name in ("index", "method", "peers", "results", "glossary"):
         page.goto((site / f"{name}.html").as_uri())
         assert page.evaluate("document.documentElement.scrollWidth") <= 390, name
+    page.goto((site / "index.html").as_uri())
+    page.get_by_role("link", name="noisy").click()
+    until_shown(page, 0)
+    page.keyboard.press("End")
+    expect(page.locator("#status")).to_have_text(re.compile("localised after"))
     assert errors == []
 
 
