@@ -4,7 +4,7 @@ import { shown } from "./configurations.js";
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
 import { held_now, lacks_bearing } from "./held.js";
 import { NAME } from "./labels.js";
-import { cross, DOTTED, fading, OUTLINED, shape } from "./pen.js";
+import { circle, cross, DOTTED, fading, OUTLINED, outlined, shape } from "./pen.js";
 import { metres, probability } from "./words.js";
 
 const FADING = 3;
@@ -35,20 +35,16 @@ export class Beliefs {
       if (place === 0 && held.arc) this.#arc(pose, held, look);
       else if (place === 0 && covariance && held.world.length) this.#ellipse(pose, covariance, look);
       const grown = truth ? size * 1.45 : size * 1.15;
-      shape(pen, robot.role, x, y, pose[2], grown);
       this.plane.targets.push({ kind: "hypothesis", robot: robot.id, place, at: [x, y], radius: grown });
       if (bearing_unknown) return;
       if (!truth && poses.length === 1) {
+        shape(pen, robot.role, x, y, pose[2], grown);
         pen.fillStyle = player.down ? look.paper : look.robot[robot.role];
         pen.fill();
       }
       if (!truth || (tints.length && size > 6)) labels.placed.push([x - size, y - size, x + size, y + size]);
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
-      pen.strokeStyle = colour;
-      pen.lineWidth = tints.length ? 2.6 : 2;
-      pen.setLineDash(held.world.length || !truth || size <= 6 ? [] : OUTLINED);
-      pen.stroke();
-      pen.setLineDash([]);
+      outlined(pen, robot.role, [x, y], pose[2], grown, colour, tints.length ? 2.6 : 2, held.world.length || !truth || size <= 6 ? [] : OUTLINED);
       const many = held.probability.length > 1 && chance > 0.01;
       const parts = [...(tints.length > 1 ? [String(tints[place] + 1)] : []), ...(many ? [probability(chance)] : [])];
       if (parts.length && place < 6 && size > 6) {
@@ -96,10 +92,7 @@ export class Beliefs {
     for (const { tint, out, [robot.role]: pose } of all) {
       const [x, y] = this.plane.at(pose), colour = look.tint(tint);
       pen.globalAlpha = out ? 0.5 : 1;
-      shape(pen, robot.role, x, y, pose[2], grown);
-      pen.strokeStyle = colour;
-      pen.lineWidth = 2.6;
-      pen.stroke();
+      outlined(pen, robot.role, [x, y], pose[2], grown, colour, 2.6);
       this.plane.marks.add(out ? "ruled-out" : "configuration");
       if (out) cross(pen, x, y, size, look);
       if (out && size > 6) this.plane.labels.placed.push([x - grown, y - grown, x + grown, y + grown]);
@@ -115,14 +108,8 @@ export class Beliefs {
     this.plane.marks.add("places");
     const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
     const range = player.anchor_range ?? store.stage.mission.sensing_range;
-    pen.beginPath();
-    pen.arc(x, y, range * this.plane.scale, 0, TAU);
-    pen.strokeStyle = look.ghost;
-    pen.lineWidth = 3;
     pen.globalAlpha = truth ? fading(share, moving) : 1; // the true robot leaves the circle
-    pen.setLineDash(DOTTED);
-    pen.stroke();
-    pen.setLineDash([]);
+    circle(this.plane, robot.anchor, range, look.ghost, 3, DOTTED);
     pen.globalAlpha = 1;
     if (!truth) this.plane.labels.put(`${robot.id}: position unknown`, x, y - range * this.plane.scale - 6, look.ghost, "center");
   }
@@ -130,18 +117,11 @@ export class Beliefs {
   /** Draws the circle of possible positions of a robot whose bearing from its anchor is unknown. */
   #any_bearing({ look }, robot, pose) {
     this.plane.marks.add("places");
-    const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
-    const radius = distance(pose, robot.anchor) * this.plane.scale;
-    pen.beginPath();
-    pen.arc(x, y, radius, 0, TAU);
-    pen.strokeStyle = look.ghost;
+    const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor), radius = distance(pose, robot.anchor);
     pen.globalAlpha = 0.5;
-    pen.lineWidth = 2;
-    pen.setLineDash(DOTTED);
-    pen.stroke();
-    pen.setLineDash([]);
+    circle(this.plane, robot.anchor, radius, look.ghost, 2, DOTTED);
     pen.globalAlpha = 1;
-    this.plane.labels.put(`${robot.id}: bearing unknown`, x, y - radius - 6, look.ghost, "center");
+    this.plane.labels.put(`${robot.id}: bearing unknown`, x, y - radius * this.plane.scale - 6, look.ghost, "center");
   }
 
   /** Draws the poses ruled out in the last FADING ticks, propagated by odometry to the current tick. */
@@ -168,12 +148,7 @@ export class Beliefs {
         if (moving) pose = between(pose, null, store.player(tick + 1, robot.id)?.executed, share, period);
         const [x, y] = this.plane.at(pose);
         pen.globalAlpha = 0.75 / age;
-        shape(pen, robot.role, x, y, pose[2], size * 1.3);
-        pen.strokeStyle = look.ghost;
-        pen.lineWidth = 1.4;
-        pen.setLineDash(OUTLINED);
-        pen.stroke();
-        pen.setLineDash([]);
+        outlined(pen, robot.role, [x, y], pose[2], size * 1.3, look.ghost, 1.4, OUTLINED);
         cross(pen, x, y, size, look);
         this.plane.marks.add("ruled-out");
         if (size > 6) this.plane.labels.placed.push([x - size, y - size, x + size, y + size]);

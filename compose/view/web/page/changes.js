@@ -3,7 +3,7 @@
 import { make } from "./cards.js";
 import * as data from "./data.js";
 import { distance, TAU } from "./geometry.js";
-import { DASHED, OUTLINED, shape } from "./pen.js";
+import { circle, DASHED, OUTLINED, shape } from "./pen.js";
 
 /** The distance in pixels from a handle within which a pointer takes it. */
 const REACH_PX = 12;
@@ -164,7 +164,6 @@ export class Changes {
     const pen = plane.context;
     for (const { robot, x, at } of this.#handles) {
       const { role } = robots.find(({ id }) => id === robot), [px, py] = plane.at(at);
-      pen.setLineDash([]);
       pen.lineWidth = 2;
       pen.strokeStyle = look.robot[role];
       pen.fillStyle = look.paper;
@@ -181,14 +180,9 @@ export class Changes {
         pen.arc(px, py, REACH_PX + 2, 0, TAU);
         pen.stroke();
       }
-      if (x === "x") continue;
-      pen.setLineDash(DASHED);
-      pen.lineWidth = 1.5;
-      pen.beginPath();
-      pen.arc(px, py, this.values.sensing_range * plane.scale, 0, TAU);
-      pen.stroke();
+      pen.setLineDash([]);
+      if (x !== "x") circle(plane, at, this.values.sensing_range, look.robot[role], 1.5, DASHED);
     }
-    pen.setLineDash([]);
   }
 }
 

@@ -3,7 +3,7 @@
 
 import { between, compose, distance, step } from "./geometry.js";
 import { held_now } from "./held.js";
-import { circle, DASHED } from "./pen.js";
+import { circle, DASHED, line } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 
 const MOST = 12; // configurations that are drawn
@@ -64,13 +64,9 @@ export class Configurations {
     const { all, measured } = shown(view, robot, this.plane.tints), live = all.slice(0, MOST);
     if (live.length < 2) return;
     this.plane.marks.add("configuration");
-    pen.lineWidth = 1.3;
     for (const { tint, a, b, out } of live.filter((_, i) => view.passed.get(robot.id)?.(i) !== false)) {
       pen.globalAlpha = out ? 0.25 : 0.9;
-      pen.strokeStyle = look.tint(tint);
-      pen.beginPath();
-      pen.moveTo(...this.plane.at(a)); pen.lineTo(...this.plane.at(b));
-      pen.stroke();
+      line(pen, [this.plane.at(a), this.plane.at(b)], look.tint(tint), 1.3);
     }
     const ruling = view.eliminated < 1 && measured !== null;
     const driving = view.moving && view.share > 0 && store.player(tick, robot.id)?.contacts?.length;
@@ -109,11 +105,8 @@ export class Configurations {
   #arrow(way, v, colour, halo = 0) {
     const pen = this.plane.context, [x, y] = this.plane.at(way.at(-1)), course = way.at(-1)[2] + (v < 0 ? Math.PI : 0);
     const back = (angle) => [x - HEAD_PX * Math.cos(course + angle), y + HEAD_PX * Math.sin(course + angle)];
-    pen.strokeStyle = pen.fillStyle = colour;
-    pen.lineWidth = 2.4 + 2 * halo;
-    pen.beginPath();
-    for (const pose of way) pen.lineTo(...this.plane.at(pose));
-    pen.stroke();
+    line(pen, way.map((pose) => this.plane.at(pose)), colour, 2.4 + 2 * halo);
+    pen.fillStyle = colour;
     pen.beginPath();
     pen.moveTo(x, y); pen.lineTo(...back(0.45)); pen.lineTo(...back(-0.45)); pen.closePath();
     pen.fill();
@@ -143,13 +136,7 @@ export class Configurations {
     if (eliminated >= 1) for (let i = 2; i < ends.length; i += 2) this.plane.labels.avoid(ends[i - 2], ends[i]);
     pen.globalAlpha = 1;
     for (const [colour, halo] of [[look.paper, HALO], [look.faint, 0]]) {
-      pen.strokeStyle = colour;
-      for (let i = 1; i < ends.length; i++) {
-        pen.lineWidth = 0.8 + THICK * Math.min(reachable[i].separation_m2 / most, 1) + halo;
-        pen.beginPath();
-        pen.moveTo(...ends[i - 1]); pen.lineTo(...ends[i]);
-        pen.stroke();
-      }
+      for (let i = 1; i < ends.length; i++) line(pen, ends.slice(i - 1, i + 1), colour, 0.8 + THICK * Math.min(reachable[i].separation_m2 / most, 1) + halo);
     }
     this.#arrow(way, command.v, look.paper, 0.5 * HALO);
     this.#arrow(way, command.v, look.ink);

@@ -1,7 +1,7 @@
 // Why exact distances leave several hypotheses: the mirror images of phase 1, and the crossings of an encounter.
 
 import { compose, distance, frame_of, step, TAU, wrap } from "./geometry.js";
-import { circle, DASHED, DOTTED } from "./pen.js";
+import { circle, DASHED, DOTTED, line } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 import { metres } from "./words.js";
 
@@ -64,16 +64,16 @@ export class Construction {
     if (!found) return;
     const [x, y] = robot.anchor, largest = Math.max(...found.ranges.map(([, range]) => range));
     for (const [k, range] of found.ranges) {
-      circle(this.plane, robot.anchor, range, look.range, 1.2);
-      if (k !== tick) this.plane.labels.put(metres(range), ...this.plane.at([x, y - range]), look.range, "center");
+      circle(this.plane, robot.anchor, range, look.ghost, 2, DOTTED);
+      if (k !== tick) this.plane.labels.put(metres(range), ...this.plane.at([x, y - range]), look.ghost, "center");
     }
     const start = found.ways[0].find((pose, i) => distance(pose, found.ways[1][i]) < 1e-6);
     if (start) {
       const reach = (AXIS * largest) / Math.max(distance(start, [x, y]), 1e-9), end = (sign) => this.plane.at([x + sign * reach * (start[0] - x), y + sign * reach * (start[1] - y)]);
-      this.#line([end(-1), end(1)], look.faint, 1, DASHED);
+      line(pen, [end(-1), end(1)], look.faint, 1, DASHED);
     }
-    for (const way of found.ways) this.#line(way.map((pose) => this.plane.at(pose)), look.ghost, 1.6, []);
-    for (const mark of start ? ["places", "axis"] : ["places"]) this.plane.marks.add(mark);
+    for (const way of found.ways) line(pen, way.map((pose) => this.plane.at(pose)), look.ghost, 1.6);
+    for (const mark of ["places", "way", ...(start ? ["axis"] : [])]) this.plane.marks.add(mark);
     pen.globalAlpha = 1;
   }
 
@@ -91,7 +91,7 @@ export class Construction {
     if (turned < 1) {
       const path = found.path.map(about), met = found.turns.some((turn) => Math.abs(wrap(turn - angle)) < PASSING);
       found.distances.forEach((range, i) => circle(this.plane, path[i], range, met ? look.ink : look.link, met ? 2 : 1.2));
-      this.#line([found.anchor, ...path].map((one) => this.plane.at(one)), look.ink, 1.6, []);
+      line(pen, [found.anchor, ...path].map((one) => this.plane.at(one)), look.ink, 1.6);
       pen.fillStyle = look.ink;
       for (const place of found.places.map(about)) {
         pen.beginPath();
@@ -101,16 +101,5 @@ export class Construction {
     }
     pen.globalAlpha = 1;
     return (i) => turned >= 1 || found.turns[i] <= turned * TAU;
-  }
-
-  #line(points, colour, width, dash) {
-    const pen = this.plane.context;
-    pen.strokeStyle = colour;
-    pen.lineWidth = width;
-    pen.setLineDash(dash);
-    pen.beginPath();
-    for (const point of points) pen.lineTo(...point);
-    pen.stroke();
-    pen.setLineDash([]);
   }
 }

@@ -1,9 +1,9 @@
 // What the page shows of a group: who localises whom, and how many robots are localised.
 
 import { distance } from "./geometry.js";
-import { DOTTED } from "./pen.js";
+import { DOTTED, line } from "./pen.js";
 import { joined } from "./tints.js";
-import { plural } from "./words.js";
+import { PHASES, plural, STEPS } from "./words.js";
 
 const HEAD = 7; // the length in pixels of an arrow's head
 const TRAVELLING = "travelling";
@@ -24,14 +24,9 @@ export function draw_tree(pen, plane, { store, tick, look }) {
     const ahead = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];
     const at = (way, across = 0) => [from[0] + way * ahead[0] - across * ahead[1], from[1] + way * ahead[1] + across * ahead[0]];
     const tip = length - reach - 2;
-    pen.strokeStyle = pen.fillStyle = done ? look.robot.a : look.orbit;
+    pen.fillStyle = done ? look.robot.a : look.orbit;
     pen.globalAlpha = done ? 0.75 : 0.8;
-    pen.lineWidth = done ? 1.3 : 1;
-    pen.setLineDash(done ? [] : DOTTED);
-    pen.beginPath();
-    pen.moveTo(...at(reach + 2)); pen.lineTo(...at(tip - HEAD));
-    pen.stroke();
-    pen.setLineDash([]);
+    line(pen, [at(reach + 2), at(tip - HEAD)], pen.fillStyle, done ? 1.3 : 1, done ? [] : DOTTED);
     pen.beginPath();
     pen.moveTo(...at(tip)); pen.lineTo(...at(tip - HEAD, 0.4 * HEAD)); pen.lineTo(...at(tip - HEAD, -0.4 * HEAD));
     pen.closePath();
@@ -59,7 +54,8 @@ export function task(player, robot) {
   if (state === TRAVELLING) return `to ${robot.peer}`;
   if (state === "localised" || (verdict && verdict[0] !== "localised")) return verdict?.[0] ?? state;
   if (waits(player)) return "waiting";
-  return phase === 3 && robot.anchor && state !== "looping" ? `meets ${robot.peer}` : state;
+  if (phase === 3 && robot.anchor && state !== "looping") return `meets ${robot.peer}`;
+  return robot.own_planner || ["sweeping", "looping"].includes(state) ? state : (robot.peer ? PHASES : STEPS)[phase];
 }
 
 /** Returns whether a robot waits for another one: beside its anchor, or without an anchor where it is. */

@@ -34,6 +34,7 @@ const LASTING = {
 const MOMENTARY = {
   down: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-width="2"/><path d="${cross}" stroke="var(--fault)" stroke-width="2"/>`), "robot whose process is gone"],
   places: [drawn('<circle cx="15" cy="8" r="6.5" fill="none" stroke="var(--ghost)" stroke-width="2.4" stroke-dasharray="1.5 4"/><path d="M15 5.5l2.5 4.3h-5z" fill="var(--ink)"/>'), "all places at the measured distance"],
+  way: [line("ghost", 'stroke-width="1.6"'), "path by a hypothesis"],
   axis: [line("faint", 'stroke-width="1" stroke-dasharray="6 4"'), "mirror axis: distances to the anchor do not tell its sides apart"],
   crossing: [drawn('<circle cx="10" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-dasharray="6 4"/><circle cx="20" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-width="2" stroke-dasharray="1.5 4"/>'), "turned about its anchor, the driven path fits where the circles cross"],
   distance: [drawn(`${GLOW}<path d="M1 8h28" stroke="var(--range)" stroke-width="2"/>`), ({ team }) => `distance to ${team ? "an" : "the"} anchor`],
@@ -54,13 +55,14 @@ const MOMENTARY = {
   reachable: [drawn('<path d="M3 13q12-14 24-4" fill="none" stroke="var(--faint)" stroke-width="4"/>'), ({ mover }) => `where ${mover} could drive; thick: predictions differ more`],
   choice: [drawn('<path d="M3 11q10-9 19-4" fill="none" stroke="var(--ink)" stroke-width="2"/><path d="M28 9.5l-8 1.5 3.5-6z" fill="var(--ink)"/>'), ({ mover }) => `manoeuvre chosen by ${mover}`],
   predicted: [drawn('<circle cx="15" cy="8" r="6" fill="none" stroke="var(--tint-1)" stroke-width="1.8" stroke-dasharray="6 4"/><path d="M15 8h6" stroke="var(--tint-1)"/>'), "distance that a hypothesis predicts"],
+  inset: [drawn('<rect x="3" y="1" width="24" height="14" fill="none" stroke="var(--ring)"/><rect x="8" y="5" width="8" height="5" fill="none" stroke="var(--ink)"/>'), "all robots, and what is in view"],
   measured: [ring("ink", 'style="stroke-width: 4; opacity: 0.2"'), "measured distance"],
 };
 /** The drawing of the bands of the time line. */
 const BANDS = drawn('<path d="M1 8h9" stroke="var(--faint)" stroke-width="3"/><path d="M10 8h9" stroke="var(--faint)" stroke-width="6"/><path d="M19 8h10" stroke="var(--faint)" stroke-width="10"/>');
 /** The signs above the time line. */
 const TIMES = {
-  contact: "in range of each other", claim: "a robot claims its pose", inconsistent: "a contradiction is found",
+  contact: "robots in range (shaded)", claim: "a robot claims its pose", inconsistent: "a contradiction is found",
   several: "number of hypotheses of a robot", undecided: "a robot stops without a claim", down: "a process is gone", back: "a process is back",
 };
 

@@ -28,13 +28,15 @@ export const DOTTED = [1.5, 5], DASHED = [7, 5];
 /** The dashes of the outline of a robot. */
 export const OUTLINED = [3, 2.2];
 
-/** Draws a line below the measurements of this tick in the one colour of what is now. */
-export function glow(pen, look, from, to) {
+/** Draws a line through `points`, in pixels. */
+export function line(pen, points, colour, width, dash = []) {
+  pen.strokeStyle = colour;
+  pen.lineWidth = width;
+  pen.setLineDash(dash);
   pen.beginPath();
-  pen.moveTo(...from); pen.lineTo(...to);
-  pen.strokeStyle = look.now;
-  pen.lineWidth = 8;
+  for (const point of points) pen.lineTo(...point);
   pen.stroke();
+  pen.setLineDash([]);
 }
 
 /** Draws a circle about a place of the plane; `radius` is in m, `width` and `dash` are in pixels. */
@@ -49,14 +51,20 @@ export function circle(plane, centre, radius, colour, width, dash = []) {
   pen.setLineDash([]);
 }
 
+/** Draws the outline of a robot. */
+export function outlined(pen, role, [x, y], heading, size, colour, width, dash = []) {
+  shape(pen, role, x, y, heading, size);
+  pen.strokeStyle = colour;
+  pen.lineWidth = width;
+  pen.setLineDash(dash);
+  pen.stroke();
+  pen.setLineDash([]);
+}
+
 /** Draws a cross over a robot. */
 export function cross(pen, x, y, size, look) {
   const r = 0.7 * size;
-  pen.strokeStyle = look.fault;
-  pen.lineWidth = 2;
-  pen.beginPath();
-  pen.moveTo(x - r, y - r); pen.lineTo(x + r, y + r); pen.moveTo(x + r, y - r); pen.lineTo(x - r, y + r);
-  pen.stroke();
+  for (const side of [-r, r]) line(pen, [[x - r, y - side], [x + r, y + side]], look.fault, 2);
 }
 
 export class Look {

@@ -8,7 +8,7 @@ import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
 import { heads, links } from "./group.js";
 import { Labels, NAME } from "./labels.js";
-import { cross, Look, OUTLINED, shape, unit } from "./pen.js";
+import { circle, cross, line, Look, OUTLINED, outlined, shape, unit } from "./pen.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
@@ -20,13 +20,15 @@ const EASE_S = 0.45;
 /** The distance in pixels from which on the camera is where it is needed. */
 const NEAR_PX = 0.5;
 /** The height in pixels down to the end of a caption, the largest share of the plane that it counts for, and the part of it that is in the margin. */
-const CAPTION_PX = 92, CAPTION_SHARE = 0.2, CLEAR_PX = 12;
+const CAPTION_PX = 92, CAPTION_SHARE = 0.3, CLEAR_PX = 12;
 /** The distance in pixels that a pointer moves before it drags the plane instead of selecting what is there. */
 const DRAG_PX = 4;
 const VISIBLE_PX = 2; // the sensing range from which on poses and measurements can be told from the robots
 const ALL_DRAWN = 8; // robots that are all drawn, also those that are out of view
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const LEAST_PX = 40;
+/** The sides of the small map of a group as shares of the plane's, and the least zoom of the camera with which it is drawn. */
+const INSET = 0.2, ZOOMED = 2.5;
 /** The largest group whose robots always have their names. */
 const NAMED = 20;
 
@@ -315,6 +317,26 @@ export class Plane {
     this.#backdrop.beacons(view, robots);
     for (const robot of robots) if (robot.role === "a") this.#configurations.manoeuvre(view, robot);
     if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
+    if (truth && store.stage.visits?.length) this.#inset(view);
+  }
+
+  /** Draws a small map of a group in a corner, with a frame around what is in view, unless most is. */
+  #inset({ store, look, places }) {
+    const { robots } = store.stage, whole = this.#framed(scenario_discs(robots, store)), pen = this.context, share = INSET * whole.scale;
+    if (this.scale < ZOOMED * whole.scale) return;
+    const wide = INSET * this.width, tall = INSET * this.height, left = this.width - wide - 14, top = this.height - tall - 38;
+    const at = ([x, y]) => [left + wide / 2 + share * (x - whole.centre[0]), top + tall / 2 - share * (y - whole.centre[1])];
+    const [x, y] = at(this.centre), half = [this.width, this.height].map((size) => (share * size) / this.scale / 2);
+    this.marks.add("inset");
+    this.labels.placed.push([left, top, left + wide, top + tall]);
+    pen.fillStyle = look.paper;
+    pen.strokeStyle = look.ring;
+    pen.lineWidth = 1;
+    pen.fillRect(left, top, wide, tall);
+    pen.strokeRect(left, top, wide, tall);
+    for (const { id, role } of robots) if (places.get(id)) circle({ context: pen, at, scale: 1 }, places.get(id), 1.5, look.robot[role], 3);
+    pen.strokeStyle = look.ink;
+    pen.strokeRect(x - half[0], y - half[1], 2 * half[0], 2 * half[1]);
   }
 
   /** Draws the pose that an attacker reports, and how far it is from the true one. */
@@ -325,18 +347,11 @@ export class Plane {
     const [x, y] = this.at(pose), [to_x, to_y] = this.at(true_pose);
     this.marks.add("reported");
     pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
-    pen.strokeStyle = look.fault;
-    pen.lineWidth = 1;
-    pen.beginPath();
-    pen.moveTo(x, y); pen.lineTo(to_x, to_y);
-    pen.stroke();
+    line(pen, [[x, y], [to_x, to_y]], look.fault, 1);
     shape(pen, robot.role, x, y, pose[2], size);
     pen.fillStyle = look.paper;
     pen.fill();
-    pen.lineWidth = 1.5;
-    pen.setLineDash(OUTLINED);
-    pen.stroke();
-    pen.setLineDash([]);
+    outlined(pen, robot.role, [x, y], pose[2], size, look.fault, 1.5, OUTLINED);
     const text = `${robot.id} reported, ${metres(distance(pose, true_pose))} off`;
     const half = pen.measureText(text).width / 2;
     const along = (part) => [Math.min(Math.max(x + part * (to_x - x), half), this.width - half), y + part * (to_y - y) - 12];
@@ -361,15 +376,10 @@ export class Plane {
     const pen = this.context, [x, y] = this.at(pose);
     const down = scene.players[store.places.get(robot.id)]?.down;
     pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
-    shape(pen, robot.role, x, y, pose[2], size);
-    pen.lineWidth = size > 6 ? 4.5 : 3;
-    pen.strokeStyle = look.paper;
-    pen.stroke();
+    outlined(pen, robot.role, [x, y], pose[2], size, look.paper, size > 6 ? 4.5 : 3);
     pen.fillStyle = down ? look.paper : look.robot[robot.role];
     pen.fill();
-    pen.lineWidth = down ? 3 : size > 6 ? 1.6 : 1;
-    pen.strokeStyle = down ? look.robot[robot.role] : look.ink;
-    pen.stroke();
+    outlined(pen, robot.role, [x, y], pose[2], size, down ? look.robot[robot.role] : look.ink, down ? 3 : size > 6 ? 1.6 : 1);
     if (down) cross(pen, x, y, size, look);
     this.marks.add(down ? "down" : `robot-${robot.role}`);
     this.targets.push({ kind: "robot", robot: robot.id, at: [x, y], radius: size });

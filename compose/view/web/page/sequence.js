@@ -1,6 +1,6 @@
 // The sequence diagram: a lane for the world and for each robot, the ticks around the current one, and the reports as arrows.
 
-import { unit } from "./pen.js";
+import { cross, line, OUTLINED, unit } from "./pen.js";
 import { extent, fresh_pen, palette, resize } from "./strip.js";
 import { plural, SIGNS } from "./words.js";
 
@@ -68,20 +68,19 @@ export class Sequence {
   #lanes({ pen, store, of, rows, x, to }) {
     const half = TICK / 2;
     for (const [id, y] of rows) {
-      pen.strokeStyle = of(id === null ? "faint" : `robot-${store.stage.robots[store.places.get(id)].role}`);
-      pen.lineWidth = 2;
+      const hue = of(id === null ? "faint" : `robot-${store.stage.robots[store.places.get(id)].role}`), lane = (from, end) => line(pen, [[from, y], [end, y]], hue, 2);
       let begin = x(this.from) - half;
       for (let k = this.from; k <= to; k++) {
         const kinds = (store.scene(k)?.events ?? []).filter((event) => event.robot === id).map((event) => event.kind);
         const down = kinds.includes("down"), back = kinds.includes("back");
         if ((down || store.player(k, id)?.down) && begin !== null) {
-          line(pen, begin, y, x(k) - (down ? GAP * TICK : half), y);
+          lane(begin, x(k) - (down ? GAP * TICK : half));
           begin = null;
         }
         if (back) begin = x(k) + GAP * TICK;
         else if (!down && begin === null && !store.player(k, id)?.down) begin = id === null ? null : x(k) - half;
       }
-      if (begin !== null) line(pen, begin, y, x(to) + half, y);
+      if (begin !== null) lane(begin, x(to) + half);
     }
   }
 
@@ -139,26 +138,13 @@ function fate_of({ what, tick }, now) {
   return what === "sent" ? null : what;
 }
 
-function line(pen, x, y, to_x, to_y) {
-  pen.beginPath();
-  pen.moveTo(x, y); pen.lineTo(to_x, to_y);
-  pen.stroke();
-}
-
 /** Draws an arrow; a lost report ends half-way in a cross, a damaged one at its receiver, a delayed one is dashed. */
 function arrow(pen, x, y, to_x, to_y, fate, of) {
   const bad = fate === "lost" || fate === "damaged";
   const part = fate === "lost" ? 0.5 : 0.88, end_x = x + part * (to_x - x), end_y = y + part * (to_y - y);
-  pen.strokeStyle = of(bad ? "fault" : fate === "delayed" ? "range" : "link");
-  pen.lineWidth = 1.5;
-  pen.setLineDash(fate === "delayed" ? [4, 3] : []);
-  line(pen, x, y, end_x, end_y);
-  pen.setLineDash([]);
-  if (bad) {
-    line(pen, end_x - 3, end_y - 3, end_x + 3, end_y + 3);
-    line(pen, end_x - 3, end_y + 3, end_x + 3, end_y - 3);
-    return;
-  }
+  const hue = of(bad ? "fault" : fate === "delayed" ? "range" : "link");
+  line(pen, [[x, y], [end_x, end_y]], hue, 1.5, fate === "delayed" ? OUTLINED : []);
+  if (bad) return void cross(pen, end_x, end_y, 4.3, { fault: hue });
   const angle = Math.atan2(to_y - y, to_x - x);
-  for (const turn of [2.6, -2.6]) line(pen, end_x, end_y, end_x + 6 * Math.cos(angle + turn), end_y + 6 * Math.sin(angle + turn));
+  for (const turn of [2.6, -2.6]) line(pen, [[end_x, end_y], [end_x + 6 * Math.cos(angle + turn), end_y + 6 * Math.sin(angle + turn)]], hue, 1.5);
 }

@@ -2,11 +2,12 @@
 
 import { distance, TAU } from "./geometry.js";
 import { held_now, leads } from "./held.js";
-import { DASHED, fading, glow, OUTLINED } from "./pen.js";
+import { circle, cross, DASHED, fading, line, OUTLINED } from "./pen.js";
 import { metres } from "./words.js";
 
 const MOST_ORIGINS = 6;
 const LEGIBLE = 46; // the least length in pixels of a line that has its label in any case
+const GLOW = 8; // the width in pixels of the line below a measurement, in the one colour of what is now
 const BESIDE = 10; // the distance in pixels of a label from its line
 /** The share of a tick after which the distance of its beginning has no label any more. */
 const LABELLED = 0.2;
@@ -34,12 +35,8 @@ export class Signals {
     const pen = this.plane.context, from = this.plane.at(pose), to = this.plane.at(anchor);
     this.plane.marks.add("distance");
     pen.globalAlpha = alpha;
-    glow(pen, look, from, to);
-    pen.beginPath();
-    pen.moveTo(...from); pen.lineTo(...to);
-    pen.strokeStyle = look.range;
-    pen.lineWidth = 1.8;
-    pen.stroke();
+    line(pen, [from, to], look.now, GLOW);
+    line(pen, [from, to], look.range, 1.8);
     if (size > 6) this.plane.labels.avoid(from, to);
     const length = distance(from, to), x = (from[0] + to[0]) / 2, y = (from[1] + to[1]) / 2;
     if (alpha > 1 - 1.6 * LABELLED && (length > LEGIBLE || (size > 6 && length > 1))) {
@@ -60,19 +57,10 @@ export class Signals {
     const poses = this.#origins(view, robot);
     if (!contact || contact[1] === null || !poses.length) return;
     this.plane.marks.add("measured");
-    const pen = this.plane.context, radius = contact[1] * this.plane.scale;
+    const pen = this.plane.context, [x, y] = this.plane.at(poses[0]);
     pen.globalAlpha = fading(share, moving) * (poses.length > 1 ? 0.6 : 1);
-    pen.strokeStyle = look.link;
-    pen.lineWidth = 1.5;
-    pen.setLineDash(DASHED);
-    for (const pose of poses) {
-      pen.beginPath();
-      pen.arc(...this.plane.at(pose), radius, 0, TAU);
-      pen.stroke();
-    }
-    pen.setLineDash([]);
-    const [x, y] = this.plane.at(poses[0]);
-    this.plane.labels.put(`${contact[0]}: ${metres(contact[1])}`, x, y + radius + 14, look.link, "center");
+    for (const pose of poses) circle(this.plane, pose, contact[1], look.link, 1.5, DASHED);
+    this.plane.labels.put(`${contact[0]}: ${metres(contact[1])}`, x, y + contact[1] * this.plane.scale + 14, look.link, "center");
     pen.globalAlpha = 1;
   }
 
@@ -87,15 +75,8 @@ export class Signals {
     if (length < 1) return;
     const across = [-(other[1] - one[1]) / length, (other[0] - one[0]) / length];
     pen.globalAlpha = focus && robot.id !== focus && peer !== focus ? 0.4 : 1;
-    if (contact[1] !== null && !(moving && share > LABELLED)) glow(pen, look, one, other);
-    for (const side of [-3.5, 3.5]) {
-      pen.beginPath();
-      pen.moveTo(one[0] + side * across[0], one[1] + side * across[1]);
-      pen.lineTo(other[0] + side * across[0], other[1] + side * across[1]);
-      pen.strokeStyle = look.link;
-      pen.lineWidth = 1.4;
-      pen.stroke();
-    }
+    if (contact[1] !== null && !(moving && share > LABELLED)) line(pen, [one, other], look.now, GLOW);
+    for (const side of [-3.5, 3.5]) line(pen, [one, other].map(([x, y]) => [x + side * across[0], y + side * across[1]]), look.link, 1.4);
     this.plane.marks.add("contact");
     this.#reach(view, robot, peer, from);
     if (size > 6) this.plane.labels.avoid(one, other);
@@ -103,7 +84,7 @@ export class Signals {
       const x = (one[0] + other[0]) / 2 + 16 * across[0], y = (one[1] + other[1]) / 2 + 16 * across[1];
       this.plane.labels.put(metres(contact[1]), x, y, look.link, across[0] < 0 ? "right" : "left", { around: 16 * Math.abs(across[0]) });
     }
-    if (length > 3 * size && size > 6) {
+    if (length > 3 * size && size > 6 && !store.estimated) {
       this.#reports(view, robot.id, peer, one, other, across, 3.5);
       this.#reports(view, peer, robot.id, other, one, across, -3.5);
     }
@@ -114,16 +95,10 @@ export class Signals {
   #reach({ store, tick, share, moving, look }, robot, peer, place) {
     const alpha = fading(share, moving), earlier = store.player(tick - 1, robot.id);
     if (store.estimated || !earlier || earlier.contacts?.some(([id]) => id === peer) || alpha <= 0) return;
-    const pen = this.plane.context, before = pen.globalAlpha, radius = store.stage.mission.sensing_range * this.plane.scale;
+    const pen = this.plane.context, before = pen.globalAlpha;
     this.plane.marks.add("reach");
     pen.globalAlpha = 0.6 * alpha * before;
-    pen.strokeStyle = look.link;
-    pen.lineWidth = 1.2;
-    pen.setLineDash(DASHED);
-    pen.beginPath();
-    pen.arc(...this.plane.at(place), radius, 0, TAU);
-    pen.stroke();
-    pen.setLineDash([]);
+    circle(this.plane, place, store.stage.mission.sensing_range, look.link, 1.2, DASHED);
     pen.globalAlpha = before;
   }
 
@@ -155,13 +130,7 @@ export class Signals {
     const pen = this.plane.context, before = pen.globalAlpha;
     pen.globalAlpha = before * alpha;
     this.plane.marks.add(sign === "heard" ? "report" : sign);
-    if (sign === "late") {
-      pen.beginPath();
-      pen.moveTo(...behind); pen.lineTo(x, y);
-      pen.strokeStyle = look.link;
-      pen.lineWidth = 4;
-      pen.stroke();
-    }
+    if (sign === "late") line(pen, [behind, [x, y]], look.link, 4);
     pen.beginPath();
     pen.arc(x, y, Math.min(5, 0.5 * size), 0, TAU);
     pen.fillStyle = sign === "heard" || sign === "late" ? look.link : look.paper;
@@ -171,11 +140,7 @@ export class Signals {
     pen.setLineDash(sign === "lost" ? OUTLINED : []);
     pen.stroke();
     pen.setLineDash([]);
-    if (sign === "damaged") {
-      pen.beginPath();
-      pen.moveTo(x - 3.5, y - 3.5); pen.lineTo(x + 3.5, y + 3.5); pen.moveTo(x + 3.5, y - 3.5); pen.lineTo(x - 3.5, y + 3.5);
-      pen.stroke();
-    }
+    if (sign === "damaged") cross(pen, x, y, 5, look);
     pen.globalAlpha = before;
   }
 }

@@ -3,7 +3,7 @@
 
 import { between, compose, controls, inverse, TAU } from "./geometry.js";
 import { held_now, lacks_bearing, leads } from "./held.js";
-import { DASHED, DOTTED, fading, shape, unit } from "./pen.js";
+import { DASHED, DOTTED, fading, outlined, unit } from "./pen.js";
 
 const TRAIL = { 1: { dash: DOTTED, width: 2.4 }, 2: { dash: DASHED, width: 2 }, 3: { dash: [], width: 2.6 } };
 const REPORTED_STYLE = { dash: DASHED, width: 1.3 };
@@ -83,10 +83,7 @@ export class Trails {
       });
       const [at_x, at_y, heading] = compose(turn, pose);
       pen.globalAlpha = 0.5;
-      shape(pen, robot.role, ...this.plane.at([at_x, at_y]), heading, 0.8 * size);
-      pen.strokeStyle = look.robot[robot.role];
-      pen.lineWidth = 1.2;
-      pen.stroke();
+      outlined(pen, robot.role, this.plane.at([at_x, at_y]), heading, 0.8 * size, look.robot[robot.role], 1.2);
     }
     pen.globalAlpha = 1;
   }
