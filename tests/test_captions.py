@@ -140,7 +140,7 @@ def test_a_detected_attack_is_told_as_a_contradiction_and_named_with_the_truth_o
     run = recorded(replace(scenario, robots=robots))
     captions = [caption for scene in scenes_of(run) for caption in scene.captions]
     assert captions[-2].text.startswith("b found an inconsistency in the reports of a: ")
-    assert captions[-1].text == "The mission ends, because measurements and reports contradict each other."
+    assert captions[-1].text == "The mission ends inconsistent."
     assert [one.truth for one in captions if one.truth and "false data" in one.truth] == [
         "The simulated sensors are exact. a will report false data about itself.",
         "a does report false data about itself. Believed, a would be 4.40 m off.",

@@ -98,7 +98,7 @@ LONG = """async ([encounter, last, captions]) => {
   const guide = new Guide(), view = { tick: 0, share: 0, beat: null, held: 0, focus: null, truth: true };
   guide.stage(store);
   const ticks = [];
-  while (guide.advance(view, 0.1)) { guide.text(view); ticks.push(view.tick); }
+  while (guide.advance(view, 0.1)) { guide.told(view); ticks.push(view.tick); }
   return ticks;
 }"""
 

@@ -65,7 +65,7 @@ def test_both_recordings_show_the_tick_of_one_clock(
     page.keyboard.press("ArrowRight")
     until_both_show(page, 21, 21)
     expect(page).to_have_url(re.compile("#tick=21$"))
-    frames(page)[1].locator("#tick").click()
+    frames(page)[1].locator("#stage").click()
     page.keyboard.press("ArrowRight")  # a key in a frame is one of both
     until_both_show(page, 22, 22)
     page.keyboard.press("End")

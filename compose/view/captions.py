@@ -316,7 +316,7 @@ def locating(team: PairData) -> Told:
     """Yield how many poses are first possible by all measurements, and which robots have one left."""
     new, left = [], []
     for robot, was, held in team.estimates():
-        if not was.world and held.world and not held.localised:
+        if not was.world and held.world and not held.localised and robot != team.setup.origin:
             new.append((robot, len(held.world)))
         elif len(was.world) > len(held.world) == 1:
             left.append(robot)
@@ -392,7 +392,8 @@ def fitting(pair: PairData) -> Told:
         else:
             text, latest = whom + _fit(pair, had, has), pair.held(robots[0])[1]
             if latest is not None and len(latest.probabilities) > 1:
-                text += f", the most probable with {min(round(100 * latest.probabilities[0]), 99)} %"
+                share = 100.0 * latest.probabilities[0]
+                text += f", the most probable with {'more than 99' if share > 99.0 else round(share)} %"
             distances = _two_distances(pair) if pair.exact and not had and has > 1 else ""
             yield Caption("configurations", f"{distances}{_sentence(text)}", pair.ids)
 
@@ -536,8 +537,7 @@ def _ending(setup: RunSetup, now: TickData, end: MissionEnd) -> Caption:
         case "inconsistent":
             verdicts = [now.commands[robot].verdict for robot in setup.ids if robot in now.commands]
             just_told = robots == 2 and any(isinstance(verdict, Inconsistent) for verdict in verdicts)
-            text = "The mission ends, because measurements and reports contradict each other"
-            text += "." if just_told else why
+            text = f"The mission ends inconsistent{'.' if just_told else why}"
         case "wrong":
             text = f"The mission ends with a wrong claim{why}"
         case _:

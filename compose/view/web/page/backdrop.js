@@ -8,6 +8,7 @@ import { rounded_up } from "./strip.js";
 import { kinds_of } from "./trails.js";
 import { metres } from "./words.js";
 
+const FEW = 4; // anchors of a team whose ranges are drawn in full colours
 const LEGIBLE = 26; // the least radius in pixels of an anchor's range with which the anchor has a label
 
 export class Backdrop {
@@ -42,7 +43,7 @@ export class Backdrop {
     plane.context.restore();
     plane.labels.placed.push(this.bar);
     for (const robot of near) if (robot.anchor) this.#name(view, robot, `anchor of ${robot.id}`);
-    for (const one of this.#shared(view)) this.#name(view, one, one.told ? one.id : `${one.id}, unknown`);
+    for (const one of this.#shared(view)) this.#name(view, one, one.id);
     const { anchors } = store.stage, marks = anchors.some(({ position }) => !position) && truth ? ["unsurveyed"] : [];
     if (!store.stage.team) marks.push("anchor", "orbit");
     else if (anchors.some(({ position }) => position)) marks.push("anchor");
@@ -88,7 +89,7 @@ export class Backdrop {
   #anchor(view, robot) {
     const { pen, plane } = this, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
     if (view.store.estimated) return;
-    pen.globalAlpha = alpha;
+    pen.globalAlpha = alpha * Math.min(1, FEW / view.store.stage.anchors.length);
     pen.beginPath();
     pen.arc(x, y, reach, 0, TAU);
     pen.fillStyle = look.disc;
@@ -137,8 +138,8 @@ export class Backdrop {
     const { plane } = this, { at, reach, radius, alpha } = this.#place(view, robot);
     plane.targets.push({ kind: "anchor", robot: robot.id, at, radius });
     plane.context.globalAlpha = alpha;
-    const [x, y] = at, below = [x, y + radius + 12], above = [x, y - reach - 5], [spot, other] = view.store.stage.team ? [below, above] : [above, below];
-    if (reach > LEGIBLE) plane.labels.put(label, ...spot, view.look.faint, "center", { others: [other] });
+    const [x, y] = at, below = [x, y + radius + 12], { team } = view.store.stage, above = [x, y - (team ? radius : reach) - 5];
+    if (reach > LEGIBLE) plane.labels.put(label, ...(team ? below : above), view.look.faint, "center", { around: radius + 4, others: [team ? above : below] });
     plane.context.globalAlpha = 1;
   }
 

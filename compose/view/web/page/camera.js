@@ -30,13 +30,14 @@ export function scenario_discs(robots, store) {
 /**
  * Returns the discs that the story needs in view in this tick.
  *
- * In a group, they are the robots that a caption tells of when they meet or claim, else all. While a robot has two mirror images relative to its anchor, these are what they follow from. From the encounter on, these are the robots and all poses that they consider possible, now and in the next tick, and
+ * In a group, they are the robots that the captions tell of when they meet or claim, else all; in a team, all with their hypotheses. While a robot has two mirror images relative to its anchor, these are what they follow from. From the encounter on, these are the robots and all poses that they consider possible, now and in the next tick, and
  * those that are being ruled out. Once the pair has finished, these are all pairs.
  */
 export function story_discs({ store, tick, focus, truth, eliminated, turned, told }, pair) {
   const { robots, mission: { sensing_range } } = store.stage;
   if (store.grouped && !focus) {
-    const met = ["contact", "claim"].includes(told?.kind) ? told.robots.flatMap((id) => true_and_reported(store.player(tick, id))) : [];
+    if (store.stage.team) return [...scenario_discs(robots, store), ...robots.flatMap(({ id }) => store.player(tick, id)?.held?.world ?? []).map((pose) => [pose, 0])];
+    const met = told.filter(({ kind }) => ["contact", "claim"].includes(kind)).flatMap((one) => one.robots).flatMap((id) => true_and_reported(store.player(tick, id)));
     return met.length ? met.map((pose) => [pose, sensing_range]) : scenario_discs(robots, store);
   }
   const finished = pair.every((robot) => store.player(tick - 1, robot.id)?.command?.verdict);

@@ -59,7 +59,7 @@ export class Cards {
     this.#rank(tick);
     for (const [id, entry] of this.entries) {
       const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
-      const robot = robots[store.places.get(id)], state = store.grouped ? task(player, robot) : player?.command?.state ?? "–";
+      const robot = robots[store.places.get(id)], state = task(player, robot);
       const text = `${id} ${player?.down ? "is down" : state}`;
       if (entry.dataset.role !== robot.role) entry.dataset.role = robot.role;
       if (entry.textContent !== text) entry.textContent = text;
@@ -129,13 +129,13 @@ class Card {
     const words = store.stage.team ? STEPS[phase] : `phase ${phase}${this.robot.own_planner ? "" : `: ${PHASES[phase]}`}`;
     this.phase.textContent = `${words}${player.down ? "; down" : ""}`;
     if (this.doing.textContent !== player.activity) this.doing.textContent = player.activity;
-    const attack = truth && player.reported ? attacked(store, tick, this.robot, player.reported) : "";
+    const attack = truth && player.reported ? attacked(player) : "";
     if (this.attack.textContent !== attack) this.attack.textContent = attack;
     this.attack.hidden = !attack;
     const [off, range] = truth && player.pose && held?.world.length ? error(held, player.pose) : ["", ""];
     this.error.textContent = off;
     this.error.title = range;
-    this.#row("measured", measured(player, this.robot, store.stage));
+    this.#row("measured", measured(player) || "nothing");
     this.#row("command", command ? commanded(command) : "–");
     this.#row("belief", held ? believed(held) : "–");
     if (truth) this.#row("true pose", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "unknown");
@@ -166,27 +166,16 @@ function error(held, pose) {
   return [`error up to ${most}`, `${least} to ${most}: ${off.length} poses are possible, and none has a probability above 50 %`];
 }
 
-/** Returns what the false data of an attacker contradict: its true pose, and what its peer has measured. */
-function attacked(store, tick, { id, peer }, { gap }) {
-  const off = gap < LEAST_GAP_M ? "has reported its true position so far" : `reports a position ${metres(gap)} from its true one`;
-  const verdict_at = (k) => store.player(k, peer)?.command?.verdict, verdict = verdict_at(tick);
-  if (!verdict) return `${id} ${off}.`;
-  let first = tick;
-  while (verdict_at(first - 1)) first -= 1;
-  const [kind, reason] = verdict, at = `in tick ${first}`;
-  if (kind === "localised") return `${id} ${off}. ${peer} claims its pose ${at}, and has not found a contradiction.`;
-  return `${id} ${off}. ${peer} ${kind === "undecided" ? "ends undecided" : `rejects ${id}`} ${at}: ${reason}.`;
-}
+/** Returns how far off the position is that an attacker reports. */
+const attacked = ({ robot, reported: { gap } }) => `${robot} ${gap < LEAST_GAP_M ? "has reported its true position so far" : `reports a position ${metres(gap)} from its true one`}.`;
 
-function measured(player, robot, { team, anchors, mode }) {
-  if (!player.sensed) return "unknown";
-  const odometry = player.executed ? `odometry ${speed(player.executed[0])}, ${turning(player.executed[1])}; ` : "";
-  const none = robot.anchor ? "no range to its anchor" : anchors.length ? "no range to an anchor" : "no anchor";
-  const anchor = player.anchors?.length ? player.anchors.map(([id, range]) => `${id} ${metres(range)}`).join(", ") : player.anchor_range === undefined ? none : `anchor ${metres(player.anchor_range)}`;
-  const alone = mode === "estimate" ? "no range to a robot" : team ? "no robot is in range" : `${robot.peer} is not in range`;
-  if (!player.contacts?.length) return `${odometry}${anchor}; ${alone}`;
-  const contacts = player.contacts.map(([peer, range]) => `${peer} ${range === null ? "in range, not measured" : metres(range)}`);
-  return `${odometry}${anchor}; ${contacts.join(", ")}`;
+/** Returns the odometry and the ranges of a tick, and nothing for what has no range. */
+function measured({ sensed, executed, anchor_range, anchors, contacts }) {
+  if (!sensed) return "unknown";
+  const ranged = ([id, range]) => `${id}\u00a0${range === null ? "in\u00a0range, not measured" : metres(range).replace(" ", "\u00a0")}`;
+  const own = anchor_range === undefined ? [] : [["anchor", anchor_range]];
+  const ranges = [...own, ...(anchors ?? []), ...(contacts ?? [])].map(ranged).join(", ");
+  return [executed && `odometry ${speed(executed[0])}, ${turning(executed[1])}`, ranges].filter(Boolean).join("; ");
 }
 
 const commanded = ({ v, omega }) => (v === 0 && omega === 0 ? "stop" : `${speed(v)}, ${turning(omega)}`);

@@ -27,11 +27,11 @@ const STEPS = [1, 2, 3, 5, 10];
 const STRIPS = [
   {
     title: "hypotheses", curves: ["hypotheses"], text: String, none: "no estimates in these ticks",
-    scale: ({ most }) => ({ low: 0, high: Math.max(most, 2), marks: [0, Math.max(most, 2)] }),
+    scale: ({ most }) => ({ low: 0, high: Math.max(most, 2), marks: [0, Math.max(most, 2)], plain: true }),
   },
   {
     title: "probability of the first", curves: ["probability"], text: (value) => (value === 1 ? "100 %" : probability(value)), none: "no estimates in these ticks",
-    scale: () => ({ low: 0, high: 1, marks: [0, 0.5, 1] }),
+    scale: () => ({ low: 0, high: 1, marks: [0, 0.5, 1], plain: true }),
   },
   {
     title: "error / 3 sigma", curves: ["position_error_m", "position_bound_m"], text: metres, band: "position_bound_m",
@@ -41,7 +41,7 @@ const STRIPS = [
     title: "ranges", curves: ["anchor_range_m", "mutual_range_m"], text: metres, none: "no ranges in these ticks",
     scale: ({ most }) => {
       const high = rounded_up(most || 1, STEPS);
-      return { low: 0, high, marks: [0, high], unit: " m" };
+      return { low: 0, high, marks: [0, high] };
     },
   },
   {
@@ -214,7 +214,8 @@ export class Charts {
     pen.textAlign = "right";
     pen.fillStyle = of("faint");
     for (const mark of scale.marks) {
-      const label = scale.log ? `${mark === LEAST_M ? "≤ " : ""}${mark >= 1e3 ? `${mark / 1e3} km` : metres(mark).replace(/\.0+ /, " ")}` : `${Number(mark.toPrecision(3))}${mark ? scale.unit ?? "" : ""}`;
+      const length = mark >= 1e3 ? `${mark / 1e3} km` : metres(mark).replace(/\.0+ /, " ");
+      const label = !mark || scale.plain ? String(mark) : `${scale.log && mark === LEAST_M ? "≤ " : ""}${length}`;
       pen.fillText(label, LEFT - 4, y(mark) + (mark === scale.low ? 3 : 5));
     }
     pen.save();
@@ -328,7 +329,7 @@ function joined(values) {
 /** Returns a scale with 0 in its middle. */
 function both_sides({ least, most }) {
   const high = rounded_up(Math.max(-least, most, LEAST_M), STEPS);
-  return { low: -high, high, marks: [-high, 0, high], unit: " m" };
+  return { low: -high, high, marks: [-high, 0, high] };
 }
 
 /** Returns a logarithmic scale from a power of ten to another. */

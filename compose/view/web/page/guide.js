@@ -59,25 +59,18 @@ export class Guide {
     }
   }
 
-  /** Returns the text to show: the current caption, all captions of the tick if time has stopped, or the latest one. */
-  text(view) {
+  /** Returns the captions to show: the current one, all of the tick if time has stopped, or the latest one. */
+  told(view) {
     this.#read();
-    const here = this.captions(view), with_truth = ({ text, truth }) => [text, view.truth && truth].filter(Boolean).join(" ");
-    if (view.beat !== null && here.length) return with_truth(here[Math.min(view.beat, here.length - 1)]);
-    if (here.length) return here.map(with_truth).join(" ");
+    const here = this.captions(view);
+    if (here.length) return view.beat === null ? here : [here[Math.min(view.beat, here.length - 1)]];
     for (let i = this.beats.length - 1; i >= 0; i--) {
       if (this.beats[i].tick >= view.tick) continue;
       const earlier = this.#about(this.beats[i].captions, view.focus).filter(({ kind }) => !FAULTS.has(kind));
-      if (earlier.length) return with_truth(earlier.at(-1));
+      if (earlier.length) return [earlier.at(-1)];
     }
-    return "";
+    return [];
   }
-
-  /** Returns the caption at which time has stopped; undefined if there is none. */
-  told(view) { return view.beat === null ? undefined : this.captions(view)[view.beat]; }
-
-  /** Returns whether the text to show is that of several captions. */
-  several(view) { return view.beat === null && this.captions(view).length > 1; }
 
   /** Returns how much of the elimination of configurations has been shown in this tick, from 0 to 1. */
   eliminated(view) {

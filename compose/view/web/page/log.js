@@ -1,7 +1,7 @@
 // The event log, one line per event; selecting one goes to its tick. Only events near the tick are in the DOM.
 
 import { make } from "./cards.js";
-import { KIND_NAMES, SIGNS, said } from "./words.js";
+import { SIGNS, said } from "./words.js";
 
 const NEAR = 60;
 
@@ -82,7 +82,7 @@ export class Log {
   }
 
   #item(event, truth) {
-    const sign = make("span", { className: "sign", textContent: SIGNS[event.kind], title: KIND_NAMES[event.kind] });
+    const sign = make("span", { className: "sign", textContent: SIGNS[event.kind] });
     sign.setAttribute("aria-hidden", "true");
     const go = make("button", { type: "button" }, make("b", { textContent: event.tick }), sign, make("span", { textContent: said(event, truth) }));
     go.addEventListener("click", () => this.go(event.tick));

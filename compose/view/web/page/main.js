@@ -23,7 +23,7 @@ import { SPEEDS, USUAL } from "./speeds.js";
 import { Store } from "./store.js";
 import { Timeline } from "./timeline.js";
 import { joined } from "./tints.js";
-import { KEYS, plural, seconds } from "./words.js";
+import { KEYS, plural, said, seconds } from "./words.js";
 
 const RESULTS = "#results"; // the address of the table and the figures of an estimate
 const SETTLED_MS = 200; // after the last movement of the camera
@@ -305,8 +305,8 @@ function draw() {
     view.turned = turned !== null && still.matches ? 1 : turned;
     // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
     controls();
-    $("caption").classList.toggle("several", guide.several(view));
-    text($("caption"), guide.text(view));
+    $("caption").classList.toggle("several", view.told.length > 1);
+    text($("caption"), view.told.map((one) => said(one, view.truth, " ")).join(" "));
     predictions.draw(view, store, guide.pair(view.focus));
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), (view.playing || plane.easing) && !still.matches ? now : null);
     attribute(document.body, "data-tick", String(view.tick));

@@ -1,12 +1,11 @@
 // The list of missions, if the server has several, and the state of a mission in a few words.
 
 import { make } from "./cards.js";
-import { outcome_chip, style } from "./outcome.js";
+import { outcome_chip } from "./outcome.js";
 import { plural } from "./words.js";
 
 /** Fills `root` with the missions of a server's list. */
 export function list_missions(root, { shows, network }) {
-  style();
   root.hidden = false;
   const where = network.map(({ endpoint, reached }) => `${endpoint}${reached ? "" : " (no router yet)"}`);
   root.replaceChildren(

@@ -10,8 +10,3 @@ export function outcome_chip(outcome, state) {
   if (outcome) chip.dataset.result = outcome;
   return chip;
 }
-
-/** Adds the style of lists and sweeps, once. */
-export function style() {
-  if (!document.getElementById("sweep-style")) document.head.append(make("link", { id: "sweep-style", rel: "stylesheet", href: "/page/sweep.css" }));
-}

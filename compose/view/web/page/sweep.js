@@ -2,10 +2,8 @@
 
 import { make } from "./cards.js";
 import { add_time, heat_map } from "./heat.js";
-import { style } from "./outcome.js";
 
 export async function sweep(root) {
-  style();
   const answer = await fetch("/api/results/sweep"), result = await answer.json();
   root.hidden = false;
   if (!answer.ok) {

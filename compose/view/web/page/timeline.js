@@ -142,6 +142,10 @@ export class Timeline {
           pen.fillText("down", left + 5, y + band - 3.5);
         }
       }
+      pen.fillStyle = of("shade");
+      for (const { from, to } of this.contacts.get(robot.id)) {
+        pen.fillRect(x(from), y - 2, Math.max(x(Math.min(to + 1, this.last)) - x(from), 2), band + 4);
+      }
       pen.textAlign = "center";
       pen.lineWidth = 3;
       for (const { from, to, value } of band > 10 ? this.counts.get(robot.id) : []) {
@@ -152,11 +156,6 @@ export class Timeline {
         this.counted = true;
         pen.strokeText(text, left + room / 2, y + band - 3);
         pen.fillText(text, left + room / 2, y + band - 3);
-      }
-      pen.textAlign = "left";
-      pen.fillStyle = of("shade");
-      for (const { from, to } of this.contacts.get(robot.id)) {
-        pen.fillRect(x(from), y - 2, Math.max(x(Math.min(to + 1, this.last)) - x(from), 2), band + 4);
       }
     });
     this.#signs(pen, x, of, ids, wide);

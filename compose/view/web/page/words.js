@@ -30,8 +30,8 @@ export function probability(value) {
   return `${(100 * value).toFixed(value < 0.1 ? 1 : 0)} %`;
 }
 
-/** Returns the text of an event, with what the ground truth adds if it is `shown`. */
-export const said = ({ text, truth }, shown) => (shown && truth ? `${text}; ${truth}` : text);
+/** Returns the text of an event or a caption, with what the ground truth adds if it is `shown`. */
+export const said = ({ text, truth }, shown, joint = "; ") => [text, shown && truth].filter(Boolean).join(joint);
 
 export const plural = (count, one) => `${count} ${one}${count === 1 ? "" : "s"}`;
 
@@ -40,14 +40,6 @@ export const SIGNS = {
   anchor: "◎", "anchor-lost": "○", contact: "⇄", "contact-lost": "⇎", phase: "§", state: "·",
   branch: "∠", candidates: "∴", claim: "★", undecided: "…", inconsistent: "!", late: "◔", end: "■", down: "⊘", back: "↻",
   "report-lost": "✕", "report-damaged": "⊗", "report-late": "◷", "report-doubled": "‖",
-};
-
-export const KIND_NAMES = {
-  anchor: "anchor in range", "anchor-lost": "anchor out of range", contact: "contact", "contact-lost": "contact lost",
-  phase: "phase", state: "state", branch: "one pose about the anchor", candidates: "hypotheses", claim: "claim",
-  undecided: "undecided", inconsistent: "inconsistent", late: "deadline missed", end: "end", down: "process gone",
-  back: "process back", "report-lost": "report lost", "report-damaged": "report damaged",
-  "report-late": "report late", "report-doubled": "report duplicated",
 };
 
 export const KEYS = [
