@@ -23,7 +23,7 @@ from agent.estimation.gaussian.anchor_guesses import (
 )
 from agent.estimation.gaussian.evidence import CLEAR, EDGE, SILENT
 from agent.estimation.gaussian.joint_ranges import JointMeasurements, Silence
-from agent.estimation.gaussian.odometry_noise import Array, Places
+from agent.estimation.gaussian.odometry_noise import Array, Places, Track, rigid_effects
 from agent.estimation.gaussian.placement_guesses import (
     CROWD,
     FINER_TURN,
@@ -79,6 +79,20 @@ def anchors_by_numpy(own: JointMeasurements, known: Sequence[Sequence[float]] = 
         return points
     variance = np.square(own.ranges.sigma) + _odometry_variance(own) + own.loosened
     return _polished(points, own, np.sqrt(variance))
+
+
+def position_variances_by_numpy(path: Track, white: Array, patterns: Array) -> Array:
+    """Return the variances of positions; see `odometry_noise.position_variances`."""
+    effects, rigid = rigid_effects(path), np.zeros((3, 3, len(path.x)))
+    by_white = np.add.reduce(effects[:, None] * effects * white, 2)
+    np.add.accumulate(by_white, -1, out=rigid[..., 1:])
+    for pattern in patterns:
+        constant = np.add.accumulate(np.add.reduce(effects * pattern, 1), -1)
+        rigid[..., 1:] += constant[:, None] * constant
+    x, y, turned = path.x, path.y, rigid[2, 2]
+    found: Array = rigid[0, 0] + rigid[1, 1] + 2.0 * (x * rigid[1, 2] - y * rigid[0, 2])
+    found += (np.square(x) + np.square(y)) * turned
+    return np.maximum(found, 0.0, out=found)
 
 
 def _crossings(own: JointMeasurements) -> Array:

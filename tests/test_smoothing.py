@@ -34,6 +34,7 @@ from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.problem import MOST_MEASURED_LENGTHS, Problem
 from protocol.motion import ORIGIN, Pose, rotated, step
 from protocol.noise import Noise, VelocityNoise
+from tests.hypotheses_by_numpy import position_variances_by_numpy
 from tests.pair_starts import alone, kinds, m2, pair_fit, pair_start, with_ranges
 
 Array = NDArray[np.float64]
@@ -115,6 +116,8 @@ def test_noise_of_the_odometry_spreads_along_the_path(
     path, k = track_of(driven, period), len(driven)
     patterns, white = np.random.default_rng(seed).normal(size=(3, 2, k)), variances(drift, path)
     of_positions = position_variances(path, white.reshape(2, k), patterns)
+    text = position_variances_by_numpy(path, white.reshape(2, k), patterns)
+    assert of_positions.tobytes() == text.tobytes()
     for tick in range(k + 1):
         effects = pose_effects(path, 0, tick)
         by_noise, by_constant = effects.reshape(3, 2 * k), np.einsum("mek,iek->im", patterns, effects)

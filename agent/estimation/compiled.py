@@ -59,6 +59,7 @@ SIGNATURES = {
     "eigen": (None, "naa"),
     "anchor_guesses": (TYPES["n"], "naaaaanaannadddna"),
     "tracked": (None, "nndaaaaaa"),
+    "position_variances": (None, "ndaaaaanaa"),
     "no_detection": (TYPES["d"], "naddn"),
     "detections": (ctypes.c_int, "anaannaaadana"),
     "same_poses": (None, "naaadda"),

@@ -24,6 +24,8 @@ void eigen(Index size, double *matrix, double *vectors);
 #define SIGMA_FLOOR 1e-6
 #define LARGEST_RATIO 700.0
 #define LEAST_CHANGE 1e-12
+#define SLIGHT 1e-4
+#define CONSTANT_ERRORS 3
 #define TAU (2.0 * M_PI)
 
 /* The densities of ranges (see range_model.py): logarithms of the shares of inliers, outliers and strays with
@@ -99,6 +101,46 @@ void tracked(Index paths, Index ticks, double period, const double *v, const dou
             y[k + 1] = y[k] + v[k] * shift[ticks + k];
         }
         heading += ticks + 1;
+    }
+}
+
+/* How the relative length of a chord changes with omega, in s, by half of the angle that it turns by. */
+static double shortening(double half, double period)
+{
+    const double by_half = fabs(half) < SLIGHT ? half / -3.0 : 1.0 / tan(half) - 1.0 / half;
+    return (0.5 * period) * by_half;
+}
+
+/* See odometry_noise.position_variances; there are `count` patterns, at most CONSTANT_ERRORS. */
+void position_variances(Index ticks, double period, const double *v, const double *omega, const double *place,
+                        const double *shift, const double *white, Index count, const double *patterns, double *to)
+{
+    static const int of[5][2] = {{0, 0}, {1, 1}, {1, 2}, {0, 2}, {2, 2}};
+    const double *x = place, *y = place + ticks + 1;
+    double by_white[5] = {0.0}, constant[CONSTANT_ERRORS][3] = {{0.0}};
+    to[0] = 0.0;
+    for (Index k = 0; k < ticks; k++) {
+        const double longer = v[k] * shortening((0.5 * period) * omega[k], period);
+        const double middle[2] = {0.5 * (x[k] + x[k + 1]), 0.5 * (y[k] + y[k + 1])};
+        const double effects[3][2] = {{shift[k], longer * shift[k] + period * middle[1]},
+                                      {shift[ticks + k], longer * shift[ticks + k] - period * middle[0]},
+                                      {0.0, period}};
+        double rigid[5];
+        for (int p = 0; p < count; p++)
+            for (int a = 0; a < 3; a++) {
+                const double *pattern = patterns + 2 * p * ticks + k;
+                constant[p][a] += effects[a][0] * pattern[0] + effects[a][1] * pattern[ticks];
+            }
+        for (int t = 0; t < 5; t++) {
+            const double *one = effects[of[t][0]], *other = effects[of[t][1]];
+            by_white[t] += one[0] * other[0] * white[k] + one[1] * other[1] * white[ticks + k];
+            rigid[t] = by_white[t];
+            for (int p = 0; p < count; p++) rigid[t] += constant[p][of[t][0]] * constant[p][of[t][1]];
+        }
+        const double at_x = x[k + 1], at_y = y[k + 1];
+        double found = rigid[0] + rigid[1] + 2.0 * (at_x * rigid[2] - at_y * rigid[3]);
+        found += (at_x * at_x + at_y * at_y) * rigid[4];
+        to[k + 1] = found < 0.0 ? 0.0 : found;
     }
 }
 

@@ -197,16 +197,12 @@ def position_variances(path: Track, white: Array, patterns: Array) -> Array:
 
     The errors are as in `effect_covariance`.
     """
-    effects, rigid = rigid_effects(path), np.zeros((3, 3, len(path.x)))
-    by_white = np.add.reduce(effects[:, None] * effects * white, 2)
-    np.add.accumulate(by_white, -1, out=rigid[..., 1:])
-    for pattern in patterns:
-        constant = np.add.accumulate(np.add.reduce(effects * pattern, 1), -1)
-        rigid[..., 1:] += constant[:, None] * constant
-    x, y, turned = path.x, path.y, rigid[2, 2]
-    found: Array = rigid[0, 0] + rigid[1, 1] + 2.0 * (x * rigid[1, 2] - y * rigid[0, 2])
-    found += (np.square(x) + np.square(y)) * turned
-    return np.maximum(found, 0.0, out=found)
+    found: Array = np.empty(len(path.x))
+    of_path = (path.v, path.omega, path.place, path.shift, np.ascontiguousarray(white))
+    library().position_variances(
+        *(len(path.v), path.period, *map(address, of_path), len(patterns), *map(address, (patterns, found)))
+    )
+    return found
 
 
 def _shortening(half: Array, period: float) -> Array:
