@@ -232,14 +232,16 @@ def main(arguments: list[str]) -> int:
     print(*rows, sep="\n")
     for mutant in chosen:
         cells = [mutant.__name__]
+        print(f"| {mutant.__name__}", end="", flush=True)
         for guided in (True,) if options.guided_only else (True, False):
             with ProcessPoolExecutor(1, multiprocessing.get_context("fork")) as process:
                 hunt = process.submit(hunted, mutant, MUTANTS[mutant], options.cpu, guided=guided)
                 says = hunt.result()
             missed += guided and says.startswith(MISSED)
             cells.append(says)
+            print(f" | {says}", end="", flush=True)
+        print(" |", flush=True)
         rows.append(f"| {' | '.join(cells)} |")
-        print(rows[-1], flush=True)
         if options.write:
             write(rows, options.cpu)
     return 0 if 10 * missed <= len(chosen) else 1

@@ -103,7 +103,7 @@ def joined(table: Table, other: Table, draw: random.Random) -> Table:
     if [one["id"] for one in table.get("robot", [])] != [one["id"] for one in other.get("robot", [])]:
         return table
     found = copy.deepcopy(dict(table))
-    for name in draw.sample(PARTS, 2):
+    for name in draw.sample(INHERITED, 2):
         if name in LISTS and other.get(name):
             found[name] = other[name]
         elif name in other.get("group", {}) and "group" in found:
@@ -384,7 +384,7 @@ def _nearer(rows: Sequence[Any], others: Sequence[Any]) -> Iterator[list[Any]]:
 
 LISTS = ("clock", "fault", "kill")
 """The lists of a scenario file whose rows are in no order."""
-PARTS = ("fault", "kill", "attack", "dies", "noise")
+INHERITED = ("fault", "kill", "attack", "dies", "noise")
 """The parts of an input that it may get from another one."""
 
 
