@@ -12,6 +12,7 @@ import argparse
 import inspect
 import multiprocessing
 import os
+import resource
 import sys
 import textwrap
 from collections.abc import Callable
@@ -184,12 +185,13 @@ MUTANTS: dict[Callable[[], None], str] = {
 
 
 def used() -> float:
-    """Return the processor time in s of the workers of this process."""
+    """Return the processor time in s of the workers of this process, those that have ended included."""
+    ended = resource.getrusage(resource.RUSAGE_CHILDREN)
     total = 0
     for one in multiprocessing.active_children():
         fields = Path(f"/proc/{one.pid}/stat").read_text().rpartition(")")[2].split()
         total += int(fields[11]) + int(fields[12])
-    return total / os.sysconf("SC_CLK_TCK")
+    return total / os.sysconf("SC_CLK_TCK") + ended.ru_utime + ended.ru_stime
 
 
 def hunted(mutant: Callable[[], None], source: str, cpu_s: float, *, guided: bool) -> str:
@@ -226,7 +228,8 @@ def main(arguments: list[str]) -> int:
     parser.add_argument("--guided-only", action="store_true")
     parser.add_argument("--write", action="store_true", help="write the table to docs/howto-hunt.md")
     options = parser.parse_args(arguments)
-    chosen = [one for one in MUTANTS if one.__name__ in (options.name or _names())]
+    by_name = {one.__name__: one for one in MUTANTS}
+    chosen = [by_name[name] for name in options.name or by_name]
     missed = 0
     rows = ["| mutant | guided | by chance |", "| --- | --- | --- |"]
     print(*rows, sep="\n")
@@ -245,10 +248,6 @@ def main(arguments: list[str]) -> int:
         if options.write:
             write(rows, options.cpu)
     return 0 if 10 * missed <= len(chosen) else 1
-
-
-def _names() -> list[str]:
-    return [one.__name__ for one in MUTANTS]
 
 
 if __name__ == "__main__":
