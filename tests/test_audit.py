@@ -250,7 +250,7 @@ def test_a_folder_without_a_recording_is_refused(tmp_path: Path) -> None:
     file, empty = tmp_path / "file", tmp_path / "empty"
     file.write_text("")
     empty.mkdir()
-    refused(tandem("audit", tmp_path / "nowhere"), "nowhere contains no recording: there is no world.journal")
+    refused(tandem("audit", tmp_path / "nowhere"), "nowhere does not exist")
     refused(tandem("audit", empty), "empty contains no recording: there is no world.journal")
     refused(tandem("audit", file), "file cannot be read: Not a directory")
     refused(tandem("audit", ""), "'' is not a path")

@@ -101,6 +101,8 @@ def user_errors(folder: Path) -> Iterator[None]:
         yield
     except OSError as error:
         journals = journals_in(folder)
+        if not folder.exists():
+            raise UserError(f"{folder} does not exist") from None
         if isinstance(error, FileNotFoundError) and folder / WORLD_JOURNAL not in journals:
             hint = "; `tandem watch` and `tandem export --tum` read the estimate in it"
             hint = hint if (folder / ESTIMATE_CSV).exists() else ""
