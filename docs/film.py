@@ -25,7 +25,7 @@ from compose.view.web.standalone import PAGE
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """The names of the program that draws the page."""
-WIDTH, HEIGHT = 900, 640
+WIDTH, HEIGHT = 800, 570
 """The size of the picture in pixels."""
 FRAME_MS = 250
 """The time between two frames in ms; the page lets no more pass between two of its drawings."""
@@ -48,7 +48,7 @@ header, aside, #further, #legend summary, #transport button, #pace { display: no
 #caption { min-height: 2.8rem; }
 """
 """The style that hides the parts of the page which are not the story, or are for the mouse."""
-COLOUR_SHARES = (1.0, 0.72, 0.45, 0.2)
+COLOUR_SHARES = (1.0, 0.5)
 """The shares of a colour of the page on its background that are colours of the picture."""
 MIXED = (("robot-a", "ink", 0.8), ("robot-b", "ink", 0.8), ("accent", "paper", 0.05))
 """Further colours of the picture, each a share of one colour on another.

@@ -36,7 +36,10 @@ export function scenario_discs(robots, store) {
 export function story_discs({ store, tick, focus, truth, eliminated, turned, told }, pair) {
   const { robots, mission: { sensing_range } } = store.stage;
   if (store.grouped && !focus) {
-    if (store.stage.team) return [...scenario_discs(robots, store), ...robots.flatMap(({ id }) => store.player(tick, id)?.held?.world ?? []).map((pose) => [pose, 0])];
+    if (store.stage.team) {
+      const players = robots.map(({ id }) => store.player(tick, id)), poses = players.flatMap((player) => [...(truth ? true_and_reported(player) : []), ...(player?.held?.world ?? [])]);
+      return [...scenario_discs(robots, store).map(([at]) => at), ...poses].map((at) => [at, AROUND * sensing_range]);
+    }
     const met = told.filter(({ kind }) => ["contact", "claim"].includes(kind)).flatMap((one) => one.robots).flatMap((id) => true_and_reported(store.player(tick, id)));
     return met.length ? met.map((pose) => [pose, sensing_range]) : scenario_discs(robots, store);
   }
