@@ -25,7 +25,7 @@ from compose.view.web.standalone import PAGE
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome")
 """The names of the program that draws the page."""
-WIDTH, HEIGHT = 800, 570
+WIDTH, HEIGHT = 900, 600
 """The size of the picture in pixels."""
 FRAME_MS = 250
 """The time between two frames in ms; the page lets no more pass between two of its drawings."""
