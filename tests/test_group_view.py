@@ -447,6 +447,28 @@ def test_localised_robots_have_another_colour_in_foxglove(run: Run, shown: tuple
 
 
 @pytest.mark.long
+def test_a_meeting_is_shown_large_beside_a_map_of_all_robots(
+    opened: Open, folder: Path, shown: tuple[Scene, ...]
+) -> None:
+    met = next(scene.tick for scene in shown if any(one.kind == "contact" for one in scene.captions))
+    with watching(folder) as (_, address):
+        page = opened(address)
+        apart = {}
+        for tick in (met - 1, met, met + 1):
+            scrub_to(page, tick)
+            inks(page)
+            robots = page.evaluate("document.getElementById('canvas').targets").copy()
+            (x, y), (other_x, other_y) = (
+                one["at"] for one in robots if one["kind"] == "robot" and one["robot"] in ("r0", "r1")
+            )
+            apart[tick] = ((x - other_x) ** 2 + (y - other_y) ** 2) ** 0.5
+            explained = "all robots, and what is in view" in page.locator("#legend").inner_text()
+            assert explained == (tick >= met)
+        assert apart[met] > 4 * apart[met - 1]
+        assert apart[met + 1] > 4 * apart[met - 1]
+
+
+@pytest.mark.long
 def test_the_page_shows_how_localisation_spreads(opened: Open, folder: Path) -> None:
     with watching(folder) as (_, address):
         page = opened(address)
