@@ -26,8 +26,6 @@ class PeerState(msgspec.Struct, frozen=True):
     """The last tick of this robot's manoeuvres that the peer has acknowledged."""
     ranges_acknowledged: int = 0
     """The number of this robot's anchor ranges that the peer has acknowledged."""
-    heard: int = 0
-    """The number of reports received, repeated ones included."""
     ranges_through: int = -1
     """The tick through which the peer's anchor ranges are complete: a tick without one had no detection."""
 
@@ -76,7 +74,6 @@ def with_report(peer_state: PeerState, report: Report) -> PeerState:
         latest=max(report.tick, peer_state.latest),
         acknowledged=report.heard if latest else peer_state.acknowledged,
         ranges_acknowledged=report.ranges_heard if latest else peer_state.ranges_acknowledged,
-        heard=peer_state.heard + 1,
         ranges_through=max(ranges_through, peer_state.ranges_through)
         if continues
         else peer_state.ranges_through,

@@ -316,8 +316,6 @@ class LogPlanner(Planner[RobotState, Report]):
         own, belief, plan = state.own_anchor, state.belief, state.plan
         return Summary(
             anchor_ranges=len(state.log.ranges),
-            mutual_ranges=len(state.mutual),
-            reports_heard=state.peer_state.heard,
             branch=own.kind,
             alpha=own.branch.alpha if own.branch is not None else None,
             candidates=belief.candidates,
