@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import msgspec
 
+from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Knowledge
 from protocol.messages import Localised, Ranged, ReportedPose, Verdict
 from protocol.motion import ORIGIN, Pose
@@ -64,6 +65,19 @@ class Fix(msgspec.Struct, frozen=True):
     """That claim."""
     peers: tuple[str, ...]
     """The robots whose meetings agree, in their order."""
+
+    def contradiction(self, claim: Localised, now: Knowledge) -> str | None:
+        """Return in words by how much a present `claim` contradicts this pose; None if it does not.
+
+        The claims of robots with exact sensors have no covariance, and are never wrong.
+        """
+        if claim.covariance is None:
+            return None
+        mission = now.config.mission
+        off = difference(self.claim, self.known.tick, claim, now.tick, now.log, mission)
+        if off.p_value >= 1.0 - mission.confidence:
+            return None
+        return f"{off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
 
 
 class Confirming(msgspec.Struct, frozen=True):

@@ -15,7 +15,6 @@ from functools import partial
 from msgspec.structs import astuple, replace
 
 from agent.estimation.claim import NORMAL_RATIO, Blocked, claim
-from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.gaussian.followed_pair import followed_later
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import pair_of
@@ -143,7 +142,7 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     """
     fix = state.agenda.fix
     assert fix is not None
-    off = contradiction(state, Localised(reference.pose, reference.covariance))
+    off = fix.contradiction(Localised(reference.pose, reference.covariance), state)
     if off is None:
         return _with_reference(state, reference)
     if len(fix.peers) > 1:
@@ -193,20 +192,6 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     state = _with_estimate(state, found, judged)
     reference = _reference(state, judged)
     return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
-
-
-def contradiction(state: RobotState, claim: Localised) -> str | None:
-    """Return in words by how much the present `claim` contradicts the known pose; None if it does not.
-
-    The claims of robots with exact sensors have no covariance, and are never wrong.
-    """
-    fix, mission = state.agenda.fix, state.config.mission
-    if fix is None or claim.covariance is None:
-        return None
-    off = difference(fix.claim, fix.known.tick, claim, state.tick, state.log, mission)
-    if off.p_value >= 1.0 - mission.confidence:
-        return None
-    return f"{off.position:.3g} m and {off.heading:.3g} rad (p = {off.p_value:.2g})"
 
 
 def beacon_place(state: RobotState) -> Place:

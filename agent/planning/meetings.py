@@ -8,7 +8,6 @@ from msgspec.structs import replace
 
 from agent.planning import appointments, searching, sweep, visit
 from agent.planning.agenda import Fix
-from agent.planning.beacon_sweep import contradiction
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
 from protocol.messages import Localised, Report, Undecided
@@ -75,7 +74,7 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
         fix = Fix(known, claim, (peer,))
         return state.with_agenda(fix=fix, confirming=confirming).with_frame(claim.pose)
     state = state.with_other(peer, localised=True)
-    off = contradiction(state, claim)
+    off = fix.contradiction(claim, state) if fix is not None else None
     if off is None:
         fix = Fix(known, claim, (*(fix.peers if fix is not None else ()), peer))
         state = state.with_agenda(fix=fix).with_frame(claim.pose)
