@@ -148,13 +148,10 @@ def decisive_ranges(robot: int, used: JointMeasurements) -> int:
     are at most as many as connect it, by any way, with what determines the frame: robots that know all about
     each other, and have three ranges to all others, are where these three admit.
     """
-    ranges, total, of_anchors = used.ranges, 0, []
+    total, of_anchors = 0, []
     fixed = {-1, *used.placed, *used.started}
     left: dict[int, dict[int, int]] = {k: {} for k in (-1, *range(len(used.robots)))}
-    for pair in ranges.pairs:
-        rows = np.flatnonzero(pair)
-        ends = int(ranges.first[rows[0]]), int(ranges.second[rows[0]])
-        count = len(used.from_places(ends, ranges.tick[rows]))
+    for ends, count in used.places_of_pairs:
         if robot in ends:
             total += count
             of_anchors += [count] if ends[1] < 0 or used.is_anchor(ends[1]) else []

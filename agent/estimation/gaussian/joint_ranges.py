@@ -391,6 +391,15 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         """The indices of the mutual ranges of a pair that are the first, or follow a motion of a robot."""
         return self.from_places((0, 1), self.ranges.tick[self.ranges.mutual])
 
+    @cached_property
+    def places_of_pairs(self) -> list[tuple[tuple[int, int], int]]:
+        """The two ends of each pair of radios, and the number of its ranges that are `from_places`."""
+        ranges, found = self.ranges, []
+        for rows in map(np.flatnonzero, ranges.pairs):
+            ends = int(ranges.first[rows[0]]), int(ranges.second[rows[0]])
+            found.append((ends, len(self.from_places(ends, ranges.tick[rows]))))
+        return found
+
     def alone(self, robot: int) -> JointMeasurements:
         """Return the measurements of one robot near its anchor, which is the origin.
 
