@@ -83,12 +83,12 @@ def compiler() -> str:
     return str(library().compiler().decode()).strip()
 
 
-_MEMORY = ctypes.c_char * 0
+_memory_of = (ctypes.c_char * 0).from_buffer
 
 
 def address(array: Any) -> ctypes.Array[ctypes.c_char]:
     """Return the memory of a contiguous array as an argument, or of a copy: `array.ctypes` is slow."""
     try:
-        return _MEMORY.from_buffer(array)
+        return _memory_of(array)
     except TypeError:  # it is read-only, or not contiguous
-        return _MEMORY.from_buffer(array.copy())
+        return _memory_of(array.copy())
