@@ -133,7 +133,7 @@ class Hunt:
         return [*left, *[self._input(draw) for _ in range(BATCH - len(left))]]
 
     def _input(self, draw: random.Random) -> Table:
-        """Return a mutation of an input of the corpus, or of one of the first inputs; always without guide."""
+        """Return a mutation of an input of the corpus, or of one of the first inputs: by chance, always."""
         if not self._guided or not self.corpus or draw.random() < SEEDS_SHARE:
             one = draw.choice(self.seeds[: 1 + len(self.corpus)] if self._guided else self.seeds)
             known = Clues(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
