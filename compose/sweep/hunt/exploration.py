@@ -18,7 +18,17 @@ from compose.launch.supervisor import ChildFailed
 from compose.sweep.hunt import coverage
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
-from compose.sweep.hunt.mutation import WITHIN_BOUNDS, Clues, Table, is_noisy, joined, mutated, seeds, simpler
+from compose.sweep.hunt.mutation import (
+    LISTS,
+    WITHIN_BOUNDS,
+    Clues,
+    Table,
+    is_noisy,
+    joined,
+    mutated,
+    seeds,
+    simpler,
+)
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
@@ -159,7 +169,8 @@ class Hunt:
 
     def _shrunk(self, table: Table, breach: Breach, examine: Examine) -> FoundBreach:
         """Return the input nearest to the source with the same breach, as far as MOST_TRIES runs show."""
-        left, tries = list(simpler(table, self.seeds[0])), 0
+        rows = {name: table[name] for name in LISTS if name in table}
+        left, tries = [{**self.seeds[0], **rows}, *simpler(table, self.seeds[0])], 0
         while left and tries < MOST_TRIES:
             size = min(self._workers, MOST_TRIES - tries)
             tried, left = left[:size], left[size:]
