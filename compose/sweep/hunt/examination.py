@@ -88,7 +88,8 @@ def examined(table: dict[str, Any], seen: Set[str] | None = None) -> Examined:
         found, moments = reached(run)
         events = {one for one in found if one.rpartition(": ")[2] in DISTURBED}
         events |= {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
-        events |= {f"clock: {who == 'world'} {one.offset} {one.drift}" for who, one in clocks.items()}
+        alone = not (kills or scenario.faults or scenario.deaths)  # then it also runs in hardware mode
+        events |= {f"clock: {alone} {who == 'world'} {one.offset} {one.drift}" for who, one in clocks.items()}
         found |= conditions | events
         known = seen or frozenset()
         in_turn = seen is None or crc32(msgspec.json.encode(table)) % FULL_EACH == 0
