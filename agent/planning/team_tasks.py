@@ -44,6 +44,12 @@ MANY_RETURNS = 2
 With less, missions in which the next ranges would suffice take longer by these loops.
 """
 
+SLOWEST = 0.5
+"""The least speed at the beginning, as a fraction of the largest one, at which a robot stays in contact.
+
+From nearer places, ranges tell less about its heading.
+"""
+
 LAPS = (0.0, 0.5, -0.5, 1.0, -1.0)
 """The distances by which consecutive laps of the way past an anchor lie outside it, in units of R."""
 
@@ -99,8 +105,7 @@ def _as_beacon(state: TeamState) -> TeamState | None:
     """Return `state` with a claim: in loops while a robot in contact has no result. The origin goes on."""
     if state.verdict is None or state.config.robot == state.team.origin:
         return None
-    controls = loop(state.config.mission, state.own, state.tick) if state.waiting_here else None
-    return state.doing_next("localised", 3, controls)
+    return state.doing_next("localised", 3, _loop(state) if state.waiting_here else None)
 
 
 def _searching(state: TeamState) -> TeamState | None:
@@ -154,7 +159,7 @@ def _returning(state: TeamState) -> TeamState | None:
 
 
 def _homing(state: TeamState, place: Pose) -> TeamState:
-    way = towards((place.x, place.y), state.odometry, state.config.mission, ARRIVED)
+    way = towards((place.x, place.y), state.odometry, state.config.mission, ARRIVED, backward=True)
     return state.doing_next("homing", 1, way)
 
 
@@ -188,7 +193,46 @@ def _lost(state: TeamState) -> Pose | None:
 
 
 def _circling(state: TeamState) -> TeamState:
-    return state.doing_next("circling", 1, loop(state.config.mission, state.own, state.tick))
+    return state.doing_next("circling", 1, _loop(state))
+
+
+def _loop(state: TeamState) -> Controls:
+    """Return the controls of a loop. Without anchors, it keeps the contacts that connect the team.
+
+    The robot turns back, on another arc, where a range would leave R if it grew as in the latest tick. Before
+    there is a growth, it drives so far that it mostly stays in range, wherever both drive.
+    """
+    mission, entries = state.config.mission, state.log.logs[state.own]
+    controls = loop(mission, state.own, state.tick)
+    if state.team.origin is None:
+        return controls
+    before = {one.to: one.range for one in entries[-2].robots} if len(entries) > 1 else {}
+    driven, v, back = entries[-1].executed or REST, abs(controls.v), False
+    for robot, rho in _connecting(state):
+        free = mission.sensing_range - rho
+        if robot in before and driven.v:
+            back = back or (rho - before[robot]) * max(v / abs(driven.v), 1.0) > free
+        else:
+            v = min(v, max(0.5 * free / mission.period, SLOWEST * mission.max_speed))
+    return Controls(v if (driven.v < 0.0) == back else -v, controls.omega)
+
+
+def _connecting(state: TeamState) -> list[tuple[int, float]]:
+    """Return the robots in contact, and the ranges to them (m), without those that are nearer to a third one.
+
+    They are those to which no way by two shorter ranges leads. If all robots keep them, all stay connected.
+    """
+    names, logs = state.team.robots, state.log.logs
+    own = {names.index(name): rho for name, rho in state.apart.items()}
+    ranges = {
+        k: {one.to: one.range for one in logs[k][state.tick].robots} if state.tick < len(logs[k]) else {}
+        for k in own
+    }
+    return [
+        (k, rho)
+        for k, rho in sorted(own.items())
+        if not any(max(own[c], ranges[k][c]) < rho for c in own if c in ranges[k])
+    ]
 
 
 def _looping(state: TeamState) -> TeamState | None:
