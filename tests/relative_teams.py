@@ -1,8 +1,8 @@
 """Teams without anchors: `uv run python -m tests.relative_teams [TEAMS]` prints the table of docs/results.md.
 
 TEAMS (100 by default) of 2, 3 and 4 robots start at random in a square of 10 m, connected by ranges of at
-most 5 m; a fifth as many of 8. Their ticks are paired with those of the same robots that drive at random, and
-their claims are beside the Cramér-Rao bound for the same measurements.
+most 5 m; a fifth as many of 8, and a twentieth of 16. Their ticks are paired with those of the same robots
+that drive at random, and their claims are beside the Cramér-Rao bound for the same measurements.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from protocol.motion import REST, Controls
 from protocol.noise import UNTOLD
 from tests.plans import table
 
-SIZES = {2: 1, 3: 1, 4: 1, 8: 5}
+SIZES = {2: 1, 3: 1, 4: 1, 8: 5, 16: 20}
 """The numbers of robots, and the number of teams of 2 for one of them."""
 SIGMA = 0.05
 MOST_TICKS = 400

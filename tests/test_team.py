@@ -51,6 +51,7 @@ from tests.commands import journals
 from tests.commands import tandem as tandem_command
 from tests.missions import kept, outcome
 from tests.moving_groups import PERIOD_S, joint_measurements, moving_group
+from tests.relative_teams import scenario_of
 from tests.series import series
 from world.hardware.driver import Reading
 from world.hardware.measurements import InvalidReading, observation_frame
@@ -144,6 +145,13 @@ def test_two_exact_robots_claim_by_five_ranges_or_drive_to_where_more_tell_enoug
     claim = run.claim("r1")
     assert claim is not None
     assert claim.position_error < 1e-9
+
+
+def test_robots_without_anchors_turn_back_before_the_range_that_connects_them_is_lost() -> None:
+    """Two of them start 4.5 m apart; on loops that did not turn back, they took 14 ticks."""
+    run = run_mission(parse(scenario_of(3, 0.0, 1002), "met"))
+    assert outcome(run) == "localised"
+    assert run.length - 1 <= 6
 
 
 def test_an_anchor_off_its_survey_is_named_before_its_ranges_pass_as_strays() -> None:
