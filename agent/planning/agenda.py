@@ -101,7 +101,7 @@ class Bypass(msgspec.Struct, frozen=True):
     blocked: int = 0
     """The number of consecutive ticks in which it has hardly moved on its way."""
     yielded: int = 0
-    """The number of ticks in which it has stood still, to let another one go first, while others are near."""
+    """The number of ticks in which it has stood still for another one; 0 again without robots in contact."""
     detours: int = 0
     """The number of times that it has driven aside."""
     places: tuple[tuple[float, float], ...] = ()

@@ -96,9 +96,7 @@ class GroupPlanner(Planner[RobotState, Report]):
             return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):
             report = exchange.report_without_log(state, state.agenda.failure)
-        elif peer == state.config.peer and (
-            state.meets or (state.sweeps and searching.steps_of(state).has_beacon)
-        ):
+        elif peer == state.config.peer and (state.meets or searching.has_beacon(state)):
             return self.report(state)
         else:
             report = searching.outside_meeting(state, peer)

@@ -4,8 +4,8 @@ In each tick, a robot drives at most half of the way that is left to the safety 
 Two robots that both do so keep it. On its way to another robot, or to its orbit and on it, a robot may then
 be blocked by another one, which stands there or is blocked itself: it drives back, then aside, and on.
 
-Of two, the one with the smaller id drives aside first. The other one stands still for a while, but not for
-ever: the first one may be at its place, and then does not move.
+A blocked robot waits only for those with a smaller id, so of robots that block each other the one with the
+smallest id never waits. The others wait for PATIENCE ticks at most, because that one may not be on its way.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from protocol.motion import Controls, Pose, compose
 from protocol.sweep_strips import Place
 
 RESERVE = 0.05
-"""The way that robots leave to each other, as a fraction of A_0, but on a way aside.
+"""The way that a robot leaves unused, as a fraction of A_0, except on a way aside, which uses it.
 
-Without it, two robots come so near that neither has any way left, and both stand there for ever. Less is
-needed where they allow for errors of the ranges: most of these are smaller, and leave them some way.
+Without it, two robots come so near that neither has any way left, and both stand there for ever. What is
+allowed for errors of the ranges is a part of it: most of them are smaller, and leave the robots some way.
 """
 
 BLOCKED_AFTER = 4
-"""The ticks in which so little way does not grow, after which it drives aside."""
+"""The number of ticks with little way left, which does not grow, after which a robot drives aside."""
 
 BLOCKED_ASIDE_AFTER = 16
 """The number of such ticks on a way aside after which it leads elsewhere.
@@ -44,9 +44,9 @@ CLEARANCE = 0.25
 """The distance by which a way aside is longer than needed, as a fraction of R."""
 
 PATIENCE = 8
-"""The ticks for which a robot that is blocked stands still if one with a smaller id is near.
+"""The ticks for which a blocked robot stands still if one with a smaller id is near.
 
-With 60, groups take as long; that one may not be on its way.
+With 60, groups take as long.
 """
 
 
@@ -55,8 +55,9 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
     mission, passing, task = state.config.mission, state.agenda.passing, state.task
     if not mission.safety_distance:
         return state
-    free = leeway(contacts, state.config.peer if state.in_contact else None, mission)
-    before = [one for one in contacts if one.peer < state.config.robot]
+    peer = state.config.peer if state.in_contact else None
+    free = leeway(contacts, peer, mission)
+    of_smaller_ids = leeway([one for one in contacts if one.peer < state.config.robot], peer, mission)
     stays = isinstance(task, Orbiting) and state.config.orbit.v == 0.0
     if stays or not isinstance(task, Travelling | Orbital):
         return state.with_agenda(passing=Bypass(free, detours=passing.detours))
@@ -66,15 +67,15 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
         if drive.way_to(state, passing.places[0], backward=True) is None:
             passing = replace(passing, places=passing.places[1:])
             state = state.with_agenda(passing=passing)
-    waits = separation.is_tight(leeway(before, None, mission), mission)
-    now = passed(passing, state.odometry, drive.controls(state), free, mission, waits=waits)
-    if now.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
-        now = replace(now, places=now.places[:2])  # what it does next leads past
-    return state.with_agenda(passing=now)
+    waits = separation.is_tight(of_smaller_ids, mission)
+    after = passed(passing, state.odometry, drive.controls(state), free, mission, waits=waits)
+    if after.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
+        after = replace(after, places=after.places[:2])  # its next task leads past the other robot
+    return state.with_agenda(passing=after)
 
 
 def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:
-    """Return `controls`, as far as other robots let a robot drive, which is on a way aside or not."""
+    """Return `controls`, shortened to the way that is left less the reserve; on a way aside, to all of it."""
     allowed = separation.SHARE_OF_EACH * separation.largest_error(mission)
     reserve = 0.0 if passing.places else max(0.0, RESERVE * mission.first_straight - allowed)
     return separation.slowed(controls, max(0.0, passing.leeway - reserve), mission)
@@ -98,8 +99,8 @@ def passed(
 ) -> Bypass:
     """Return `passing` after a tick that led `here`, if `free` m of the next `controls` may be driven.
 
-    While this is little and grows, one of two robots drives away from the other. One that is blocked stands
-    still first if it `waits` for another one to drive aside.
+    While `free` is little but grows, one of the two robots drives away from the other, and none is blocked.
+    A blocked robot drives aside, but stands still first if it `waits` for another one to do so.
     """
     blocked = passing.blocked + (free <= passing.leeway) if separation.is_tight(free, mission) else 0
     yielded = passing.yielded if math.isfinite(free) else 0

@@ -66,19 +66,17 @@ def next_task(state: TeamState) -> TeamState:
 
 
 def _passing_robots(state: TeamState) -> TeamState:
-    """Return `state` with the way that the safety distance leaves; if it is blocked, on a way aside."""
+    """Return `state` on its way past robots (see `passing`). It waits for those earlier in the team."""
     mission, here, own = state.config.mission, state.odometry, state.own
     if not mission.safety_distance:
         return state
     free = {one: separation.leeway_of_each(rho, mission) for one, rho in state.apart.items()}
-    before = [left for one, left in free.items() if state.team.robots.index(one) < own]
+    of_earlier = [left for one, left in free.items() if state.team.robots.index(one) < own]
     passing, least = state.passing, min(free.values(), default=math.inf)
     if passing.places and _aside(passing, state) is None:
         passing = replace(passing, places=passing.places[1:])
-    controls, waits = (
-        _aside(passing, state) or state.controls,
-        any(separation.is_tight(left, mission) for left in before),
-    )
+    controls = _aside(passing, state) or state.controls
+    waits = any(separation.is_tight(left, mission) for left in of_earlier)
     return replace(state, passing=passed(passing, here, controls, least, mission, waits=waits))
 
 
@@ -88,7 +86,7 @@ def safe_controls(state: TeamState) -> Controls:
 
 
 def _aside(passing: Bypass, state: TeamState) -> Controls | None:
-    """Return the controls to the next place of the way aside; None if it is there, or on no such way."""
+    """Return the controls to the next place of the way aside; None at that place, or on no such way."""
     if not passing.places:
         return None
     return towards(passing.places[0], state.odometry, state.config.mission, ARRIVED, backward=True)
