@@ -65,8 +65,8 @@ SMALLEST_LOSS = 1e-6
 """The smallest difference of log-likelihoods by which another one is divided."""
 
 
-def told(state: RobotState, peer: str, report: Report) -> Report:
-    """Return `report` with the reference of this contact, if there is one, and the log since then."""
+def with_pose(state: RobotState, peer: str, report: Report) -> Report:
+    """Return `report` with the pose at the begin of this contact, if there is one, and the log since then."""
     reference = state.agenda.own_pose.reference
     if reference is None:
         return report
@@ -186,7 +186,7 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
 
     The conditions are those of `claim`. After a large sigma, the first few ranges leave more than an ellipse
     describes, so there must be RANGES_AGAIN. If poses many sigmas away are likelier than the ellipse says,
-    the covariance is widened until it says as much, but at most by MOST_WIDENED.
+    the covariance is widened until it says as much, but at most by `claim.MOST_WIDENED`.
     """
     found, judged = followed_later("finder", state, _measured(state), searched=True)
     state = _with_estimate(state, found, judged)

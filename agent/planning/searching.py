@@ -22,12 +22,12 @@ class SweepSteps(NamedTuple):
 
     found: Resected | Contacted
     """The knowledge of a robot that is found, before it is."""
-    told: Callable[[RobotState, str, Report], Report]
-    """It adds the pose of the robot to its report to one without an anchor, if it may state it."""
+    with_pose: Callable[[RobotState, str, Report], Report]
+    """The function that adds the robot's pose to its report to one without an anchor, if it may state it."""
     begun: Callable[[RobotState, int], RobotState]
-    """It begins the sweep of a part of the area."""
+    """The function that begins the sweep of a part of the area."""
     after_tick: Callable[[RobotState, Sequence[str]], RobotState]
-    """It follows a tick of a sweep; the robots that it names have no anchor, and may be localised."""
+    """The function that advances a sweep by a tick, with the robots that it may help."""
     has_beacon: bool
     """True if the robot that was visited last stays where it is, so that the sweeping one knows its pose.
 
@@ -35,9 +35,9 @@ class SweepSteps(NamedTuple):
     """
 
 
-DEAD_RECKONED = SweepSteps(Resected(), sweep.told, sweep.begun, sweep.after_tick, has_beacon=False)
+DEAD_RECKONED = SweepSteps(Resected(), sweep.with_pose, sweep.begun, sweep.after_tick, has_beacon=False)
 CORRECTED = SweepSteps(
-    Contacted(), beacon_sweep.told, beacon_sweep.begun, beacon_sweep.after_tick, has_beacon=True
+    Contacted(), beacon_sweep.with_pose, beacon_sweep.begun, beacon_sweep.after_tick, has_beacon=True
 )
 
 
@@ -94,7 +94,7 @@ def outside_meeting(state: RobotState, peer: str) -> Report:
     report = replace(exchange.report_without_log(state, verdict), strips=sweep.strips(state))
     if not (is_helped(state, peer) and isinstance(verdict, Localised)):
         return report
-    return steps_of(state).told(state, peer, report)
+    return steps_of(state).with_pose(state, peer, report)
 
 
 def next_part(state: RobotState) -> RobotState:

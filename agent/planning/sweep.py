@@ -117,7 +117,7 @@ def along(state: RobotState, chosen: tuple[int, int]) -> RobotState:
     return state.doing(Sweeping(transformed(inverse(agenda.frame), path)))
 
 
-def told(state: RobotState, peer: str, report: Report) -> Report:
+def with_pose(state: RobotState, peer: str, report: Report) -> Report:
     """Return `report` with the present pose of the robot, which is the same for each `peer`."""
     del peer
     pose = exchange.reported_pose(state, state.agenda.frame)
