@@ -5,7 +5,7 @@ Two robots that both do so keep it. On its way to another robot, or to its orbit
 be blocked by another one, which stands there or is blocked itself: it drives back, then aside, and on.
 
 A blocked robot waits only for those with a smaller id, so of robots that block each other the one with the
-smallest id never waits. The others wait for PATIENCE ticks at most, because that one may not be on its way.
+smallest id never waits. The others wait for a few ticks at most: that one may not be on its way.
 """
 
 from __future__ import annotations
