@@ -58,8 +58,10 @@ def _is_blocked(state: RobotState) -> bool:
     One that drives away from another robot moves farther in each tick.
     """
     mission, runs = state.config.mission, state.log.runs
+    if not (mission.safety_distance and runs):
+        return False
     last, before = runs[-1], runs[-2].v if len(runs) > 1 else 0.0
-    if not (mission.safety_distance and separation.is_tight(abs(last.v) * mission.period, mission)):
+    if not separation.is_tight(abs(last.v) * mission.period, mission):
         return False
     return last.ticks > 1 or (last.v * before > 0.0 and abs(last.v) <= abs(before))
 

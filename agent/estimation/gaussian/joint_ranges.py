@@ -335,9 +335,10 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         return self if left.all() else msgspec.structs.replace(self, ranges=ranges.rows(left))
 
     def _weighed(self, rows: Places, most: int) -> Places:
-        """Return at most `most` of the `rows` of one pair of radios: fewer of each place before fewer places.
+        """Return at most `most` of the `rows` of one pair of radios.
 
-        A place is a part of the ways of both ends that is as long as MOVED says.
+        Places are left out only where one range of each is still too many. A place is a stretch of
+        MOVED * reach of the way, to which in each step the end adds that moves more.
         """
         if len(rows) <= most:
             return rows
@@ -353,14 +354,14 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         return weighed[_recent(len(weighed), most)]
 
     def _positions(self, ends: tuple[int, int], ticks: Places) -> Array:
-        """Return the x and y of those of both `ends` that drive at the `ticks`: shape (ends, 2, ticks)."""
+        """Return the x and y at the `ticks` of the robots among both `ends`, shape (robots, 2, ticks)."""
         paths = [self.paths[end] for end in ends if end >= 0 and not self.is_anchor(end)]
         return np.array([(path.x[ticks], path.y[ticks]) for path in paths])
 
     def from_places(self, ends: tuple[int, int], ticks: Places) -> Places:
-        """Return the indices of `ticks` that are the first, or when one of both `ends` has moved since.
+        """Return the indices of the first of `ticks`, and of each at which one of both `ends` has moved.
 
-        It has moved if it is further than MOVED says from where it was at the last one of them.
+        It has moved if it is farther than MOVED * reach from where it was at the index before in the result.
         """
         if not len(ticks):
             return ticks
@@ -469,7 +470,7 @@ WEIGHED_OF_PAIR = 8
 
 
 def _longest(steps: Array) -> Array:
-    """Return the longest of the `steps` of two ends, an array of ends x 2 x any."""
+    """Return the length of each of the `steps` of the robot that moves most in it; (robots, 2, any)."""
     longest: Array = hypot(steps[:, 0], steps[:, 1]).max(axis=0)
     return longest
 
