@@ -160,6 +160,19 @@ def test_robots_that_block_each_other_make_way(name: str) -> None:
     assert least >= 0.3 - 1e-9
 
 
+def test_no_robot_has_to_keep_the_distance_to_a_dead_one_which_it_cannot_range() -> None:
+    """Two robots begin 0.45 m apart; after the death of r2, r1 passes it at 0.01 m."""
+    table = table_of(5, 0)
+    table["mission"] |= {"period": 0.77, "safety_distance": 0.75}
+    table |= {"seed": 1518866833, "group": {"robots": 5, "spacing": 6.0, "dies": 54}}
+    del table["robot"]
+    run = of_frames(kept(validate(table, "dead.toml").seeded(None)))
+    least = nearest(run)
+    assert least is not None
+    assert least >= 0.45
+    assert audit_run(run).violations == ()
+
+
 @pytest.mark.long
 def test_the_audit_of_a_group_with_a_safety_distance_is_clean() -> None:
     found = audit_run(of_frames(kept(group_apart(4, 10, 1.0))))

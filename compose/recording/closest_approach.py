@@ -15,7 +15,7 @@ INSTANTS = 32
 def nearest(run: Run) -> float | None:
     """Return the smallest distance in m of a pair from its first mutual range on, also between ticks.
 
-    In a group, any two robots are a pair.
+    In a group, any two robots are a pair, until one of them is dead: no robot can range it then.
 
     The result is None if no pair had a mutual range.
     """
@@ -24,8 +24,9 @@ def nearest(run: Run) -> float | None:
 
 
 def _of_pair(run: Run, pair: tuple[int, int]) -> float | None:
-    least = None
-    for tick in run.ticks:
+    of_pair = [run.robots[place] for place in pair]
+    least, died = None, [one.tick for one in run.scenario.deaths if one.robot in of_pair]
+    for tick in run.ticks[: min(died, default=None)]:
         mutual = tick.world.contacts.get(pair)
         if least is None and (mutual is None or mutual.range is None):
             continue
