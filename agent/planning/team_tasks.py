@@ -27,7 +27,7 @@ from agent.planning.passing import limited, passed
 from agent.planning.strides import stride
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
 from protocol.messages import Undecided
-from protocol.motion import TAU, Controls, Pose
+from protocol.motion import REST, TAU, Controls, Pose
 from protocol.orbits import Orbit
 from protocol.sweep_ticks import sweep_speed
 from protocol.team_motion import loop, loop_ticks, nearest_other, spiral, way_past
