@@ -216,7 +216,7 @@ def write(rows: list[str], cpu_s: float) -> None:
     """Replace the table of PAGE by `rows`, with the processor time of each hunt."""
     before, _, rest = PAGE.read_text().partition(BEGIN)
     _, _, after = rest.partition(END)
-    told = f"At most {cpu_s:g} s of one core for each hunt, at `--seed 1`; seconds are those of the core:"
+    told = f"At most {cpu_s:g} s of one core for each hunt:"
     PAGE.write_text(f"{before}{BEGIN}\n\n{told}\n\n" + "\n".join(rows) + f"\n\n{END}{after}")
 
 

@@ -107,10 +107,10 @@ def _worse_at(place: Array, k: int, fit: Fit, measured: JointMeasurements) -> fl
 def _worse_than(free: Fit, fit: Fit, measured: JointMeasurements) -> float:
     """Return by how many squared sigmas `fit` is worse than one in which an anchor is `free`.
 
-    Its strays that are none there count in full. A noise level below 1 is none of constant errors.
+    Its strays that are none there count in full.
     """
     strays = np.maximum(free.weights - fit.weights, 0.0) * np.square(fit.residuals / measured.ranges.sigma)
-    return (fit.chi2 + float(np.sum(strays)) - free.chi2) / max(free.level, 1.0)
+    return (fit.chi2 + float(np.sum(strays)) - free.chi2) / free.level
 
 
 def displaced_anchor(tested: Iterable[Displacement]) -> Displacement | None:
