@@ -70,10 +70,9 @@ def displacements(fit: Fit, used: JointMeasurements) -> Iterator[Displacement]:
     """Yield how far each anchor with a told position seems to stand elsewhere (Wald 1943).
 
     The position of each in turn is estimated as if it were not known: then its ranges are no strays, and do
-    not raise the noise level. The length in sigmas is the least one by the covariance there, the misfit at
-    the told position on the same paths, and that on the paths of `fit`: where a few ranges admit two places,
-    that covariance is small, and where they admit two paths, only the last one is. An anchor without ranges
-    is left out.
+    not raise the noise level. The length in sigmas is the lesser one by the covariance there and the misfit
+    at the told position: where a few ranges admit two places, that covariance is small, too. An anchor
+    without ranges is left out.
     """
     ends = [used.radios[one] for one in sorted(set(used.ranges.radio.tolist()))]
     for name in [one for one in used.anchors if one in used.robots or any(one in each for each in ends)]:
@@ -90,8 +89,7 @@ def displacements(fit: Fit, used: JointMeasurements) -> Iterator[Displacement]:
                 yield Displacement(name, (x, y), 0.0, along, math.inf)
                 continue
             square = float(np.sum(np.square(product(away[None], axes)[0]) / variances))
-            worse = min(_worse_at(place, k, free, measured), _worse_than(free, fit, measured))
-            sigmas = math.sqrt(max(min(square, worse), 0.0))
+            sigmas = math.sqrt(max(min(square, _worse_at(place, k, free, measured)), 0.0))
             yield Displacement(name, (x, y), sigmas, along, math.sqrt(float(variances[1])))
 
 
@@ -102,15 +100,6 @@ def _worse_at(place: Array, k: int, fit: Fit, measured: JointMeasurements) -> fl
     shorter = hypot(*(at - fit.poses[k, :2]).T) - hypot(*(at - place).T)
     worse = np.square(residual + shorter) - np.square(residual)
     return float(np.sum(worse / np.square(rows.sigma))) / fit.level
-
-
-def _worse_than(free: Fit, fit: Fit, measured: JointMeasurements) -> float:
-    """Return by how many squared sigmas `fit` is worse than one in which an anchor is `free`.
-
-    Its strays that are none there count in full.
-    """
-    strays = np.maximum(free.weights - fit.weights, 0.0) * np.square(fit.residuals / measured.ranges.sigma)
-    return (fit.chi2 + float(np.sum(strays)) - free.chi2) / free.level
 
 
 def displaced_anchor(tested: Iterable[Displacement]) -> Displacement | None:
