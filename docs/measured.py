@@ -35,7 +35,7 @@ class Statement(NamedTuple):
 
     page: str
     begins: str
-    """Its first words."""
+    """The first words of it."""
     command: str
     """The command that measures it."""
     commit: str
