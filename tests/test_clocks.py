@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from compose.errors import BadScenario
-from compose.launch.virtual_hardware import HardwareEnd, run_hardware
+from compose.launch.virtual_hardware import HardwareEnd, _Body, run_hardware
 from compose.scenario.scenario_file import load, parse
 from protocol.messages import MissionEnd
 from protocol.network.clock import Clock, ClockError
@@ -18,6 +18,7 @@ from tests.commands import OVER, PAPER_1, tandem
 from tests.series import series
 from tests.test_field import ASSURED, both_have_ended, pair
 from world.hardware.bridge import Field
+from world.hardware.driver import Reading
 from world.scenario import Scenario
 
 
@@ -106,6 +107,30 @@ def test_clocks_may_start_anywhere(tmp_path: Path) -> None:
         clocks = {one.id: ClockError(offset) for one in scenario.robots}
         found.append(run_hardware(scenario, folder, clocks).ends)
     assert found[0] == found[1] == found[2]
+
+
+def test_a_robot_that_waited_for_another_one_does_not_make_up_the_time(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """It would do so in ticks that are too short for a Command: all would rest in them."""
+    scenario, real = load("random", seed=36), _Body.sense
+
+    def sense(body: _Body, tick: int) -> Reading:
+        network = body._ground.network
+        until = network.now + (waits if (body._id, tick) == ("b", 5) else 0.0)
+        while network.now < until:
+            body.process.wait(until)
+        return real(body, tick)
+
+    monkeypatch.setattr(_Body, "sense", sense)
+    found = []
+    for waits in (0.0, 10.0):
+        folder = tmp_path / str(waits)
+        folder.mkdir()
+        end = run_hardware(scenario, folder)
+        assert all_well(end, 2)
+        found.append(max(one.tick for one in end.ends.values()))
+    assert found[0] <= found[1] <= found[0] + 1, "all rest in the tick in which they waited"
 
 
 def test_a_clock_in_place_of_the_tick_is_found(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -85,9 +85,10 @@ def both_have_ended(out: Path, robots: dict[str, TandemProcess]) -> None:
     """
     ends = {name: robot.ended() for name, robot in robots.items()}
     late = any(f"{name}: missed the deadline in 0 of" not in ended.out for name, ended in ends.items())
+    said = "".join(ended.out + ended.err for ended in ends.values())
     for name, ended in ends.items():
-        assert ended.status in OVER, ended.out + ended.err
-        assert f"{name}: localised after" in ended.out or (late and f"{name}: undecided after" in ended.out)
+        assert ended.status in OVER, said
+        assert f"{name}: localised after" in said or (late and f"{name}: undecided after" in said), said
         if f"{name}: claims" in ended.out:
             claimed, truly = pose(ended, name, "claims"), pose(ended, name, "truly at")
             assert claimed == pytest.approx(truly, abs=1e-6)

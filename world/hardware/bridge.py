@@ -123,6 +123,8 @@ class Field:
         """The number of ticks by which the next TickStart may be ahead."""
         self._ahead = -1
         """The latest tick of another robot to which this one has had to catch up; -1 if none."""
+        self._latest = -1
+        """The latest tick in a TickStart that fits; -1 if there is none."""
         self._alive: set[str] = set()
         """The robots with a liveliness token."""
         self._unanswered: deque[tuple[int, bytes]] = deque()
@@ -248,7 +250,9 @@ class Field:
         self._tick += 1
         tick = self._tick
         now = self._inbox.clock()
-        self._next = (now if self._next == UNKNOWN else self._next) + self._tick_s
+        if self._next == UNKNOWN or (now > self._next + self._tick_s and tick >= self._latest):
+            self._next = now  # there is nobody to catch up with: time that was lost is not made up
+        self._next += self._tick_s
         if tick >= self._ahead or self._next > now:  # none while catching up: others would wait
             self._tick_start.put(encode(self._ending.tick_start(tick)))
         observation, *marks = self._measured(tick)
@@ -388,6 +392,7 @@ class Field:
         behind = left < 0 and (self._resumed or (in_group and left < -MOST_TICKS_AHEAD))
         if fits:
             self._source.hear(start.robot, now)
+            self._latest = max(self._latest, start.tick)
             if behind or (begins and left < 0):
                 self._ahead = max(self._ahead, start.tick)
         if self._is_current(start.tick):
