@@ -175,11 +175,15 @@ class AgentProcess:
         """
         if self._repeat_at is not None and self._inbox.clock() >= self._repeat_at:
             self._repeat_answers()
-        give_up = self._give_up + self._inbox.clock() - self._inbox.awake()
+        give_up = self._gives_up_at()
         return self._link.next(min(until or give_up, give_up, self._repeat_at or give_up))
 
+    def _gives_up_at(self) -> float:
+        """Return the time of the clock at which nothing has been received from the world for too long."""
+        return self._give_up + self._inbox.clock() - self._inbox.awake()
+
     def _check_timeout(self) -> None:
-        if self._inbox.awake() >= self._give_up:
+        if self._inbox.clock() >= self._gives_up_at():  # the time until which `_next` waits, to the bit
             raise NoWorld(f"nothing received from the world for {self._world_timeout:g} s")
 
     @property
