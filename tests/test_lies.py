@@ -12,6 +12,7 @@ from msgspec.structs import replace
 from agent.peer import false_reports, peer_state
 from agent.peer.motion_log import MotionLog
 from agent.planning import plausibility
+from agent.planning.assured import Assured
 from compose.errors import BadScenario
 from compose.launch.in_process import run_mission
 from compose.recording.reasons import reason_for
@@ -20,8 +21,10 @@ from compose.recording.summary_json import summary
 from compose.scenario.scenario_file import parse
 from compose.scenario.shipped_files import shipped
 from protocol.attack import Attack, Kind, Part
-from protocol.messages import Inconsistent, Ranged, Report, Undecided
+from protocol.messages import Inconsistent, Ranged, Report, RobotConfig, Undecided
 from protocol.motion import ORIGIN, Pose, Segment, follow
+from protocol.orbits import rendezvous
+from tests.groups import group_of
 from tests.series import series
 from tests.steps import Step, planner_of, steps
 
@@ -183,6 +186,7 @@ def objection(step: Step, *reports: Report) -> Inconsistent | None:
         reports[-1],
         state.config,
         1e-6,
+        Assured().rendezvous,
     )
 
 
@@ -231,6 +235,35 @@ def test_a_robot_that_reports_orbiting_must_be_on_its_orbit_and_head_along_it() 
     assert "off its orbit" in _claim(objection(step, straight))
     turned = replace(report, runs=(*late, Segment(1, 0.0, 1.0)))
     assert "heading" in _claim(objection(step, turned))
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_visitor_admits_the_orbits_of_each_meeting_that_the_visited_robot_may_have_with_it(
+    seed: int,
+) -> None:
+    scenario = group_of(4, seed)
+    planned = [
+        (one.visitor, one.visited) for one in scenario.meetings if scenario.config(one.visitor).role == "a"
+    ]
+    for retry in scenario.retries:
+        distance = scenario.config(retry.visitor).in_meeting(retry.visited, "a").anchor_distance
+        assert retry.rendezvous == rendezvous(scenario.mission, distance, "assured")
+        planned.append((retry.visitor, retry.visited))
+    for searching, other in planned:
+        visit = scenario.config(other).in_meeting(searching, "a")
+        plan = rendezvous(scenario.mission, visit.anchor_distance, "assured")
+        for orbit in (plan.a, plan.b, visit.rendezvous.b):
+            assert _of_orbiting(visit, orbit.radius) is None
+        off = _of_orbiting(visit, 1.1 * plan.a.radius)
+        assert "off its orbit" in _claim(off)
+
+
+def _of_orbiting(config: RobotConfig, radius: float) -> Inconsistent | None:
+    """Return the objection to a report of the peer that it is on an orbit of this radius."""
+    start = Pose(radius, 0.0, 0.5 * math.pi)
+    report = Report(0, config.peer, phase=2, state="orbiting", start=start)
+    heard = peer_state.with_report(peer_state.PeerState(), report)
+    return plausibility.objection(peer_state.PeerState(), heard, report, config, 1e-6, Assured().rendezvous)
 
 
 def _claim(alarm: Inconsistent | None) -> str:

@@ -276,7 +276,7 @@ def test_the_limit_of_a_reported_speed_knows_the_scale_of_wheels_and_strays(
         ranges_heard=0,
         verdict=None,
     )
-    assert (objection(PeerState(), PeerState(), told, config, math.inf) is None) == fits
+    assert (objection(PeerState(), PeerState(), told, config, math.inf, Assured().rendezvous) is None) == fits
 
 
 WORLD = """

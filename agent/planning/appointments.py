@@ -145,11 +145,9 @@ def _in_retry(state: RobotState, retry: Appointment) -> RobotState:
 
 def waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> RobotState:
     """Return `state` of a robot that waits beside its anchor, in a meeting with `peer`."""
-    before, waits = state.task, state.config.role == "b"
-    state = _in_meeting(state, peer, "b", orbits)
-    if waits and isinstance(before, Orbital):
-        return state.doing(before)
-    return _aligned(state)
+    before, state = state, _in_meeting(state, peer, "b", orbits)
+    waits = before.config.role == "b" and before.config.orbit == state.config.orbit
+    return state.doing(before.task) if waits and isinstance(before.task, Orbital) else _aligned(state)
 
 
 def _aligned(state: RobotState) -> RobotState:

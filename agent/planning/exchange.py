@@ -211,7 +211,7 @@ class LogPlanner(Planner[RobotState, Report]):
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the peer's `reports` and with the task that follows from them."""
         if reports:
-            state = plausibility.with_reports(state, reports)
+            state = plausibility.with_reports(state, reports, self.rendezvous)
         if not state.in_contact or isinstance(state.task, tasks.Done):
             return state
         match state.task:

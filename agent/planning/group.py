@@ -108,7 +108,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         if state.agenda.found is not None:
             return self.pair_planner.decide(state, reports)
         if searching.is_apart(state):
-            return _apart(state, reports)
+            return self._apart(state, reports)
         state = self._met(state, reports)
         return confirmation.onward(state) if state.config.confirms else state
 
@@ -141,6 +141,17 @@ class GroupPlanner(Planner[RobotState, Report]):
             for one in refusals
         )
         return meetings.onward(state, peer_has_left=left or has_failed)
+
+    def _apart(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
+        """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
+        for one in reports:
+            state = meetings.with_sender(state, one)
+            state = state.with_other(one.robot, acknowledged=one.heard)  # if overtaken, more is sent again
+        of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
+        heard = plausibility.with_reports(state, of_peer, self.pair_planner.rendezvous)
+        if heard.verdict == state.verdict:
+            state = heard
+        return meetings.onward(state) if state.sweeps else state
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the robot's verdict."""
@@ -195,18 +206,6 @@ class GroupPlanner(Planner[RobotState, Report]):
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""
         return self.pair_planner.required_mutual_ranges(mission)
-
-
-def _apart(state: RobotState, reports: Sequence[Report]) -> RobotState:
-    """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
-    for one in reports:
-        state = meetings.with_sender(state, one)
-        state = state.with_other(one.robot, acknowledged=one.heard)  # if overtaken, more is sent again
-    of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
-    heard = plausibility.with_reports(state, of_peer)
-    if heard.verdict == state.verdict:
-        state = heard
-    return meetings.onward(state) if state.sweeps else state
 
 
 def _is_out_of_range_again(before: RobotState, after: RobotState) -> bool:

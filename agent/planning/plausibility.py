@@ -6,7 +6,7 @@ The mutual ranges are evaluated elsewhere: by the estimator (`Estimator.pair`).
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from msgspec.structs import replace
 
@@ -17,7 +17,11 @@ from agent.planning.state import RobotState
 from agent.planning.tasks import Orbiting
 from protocol.messages import Inconsistent, Report, RobotConfig, Undecided
 from protocol.mission import Mission
-from protocol.motion import wrap
+from protocol.motion import Pose, wrap
+from protocol.orbits import Orbit, Rendezvous
+
+OrbitsOfPair = Callable[[Mission, float], Rendezvous]
+"""The type of `Planner.rendezvous`."""
 
 SPEED_SLACK = 1e-9
 """The relative tolerance of v_max and omega_max for rounding."""
@@ -26,16 +30,17 @@ NOISY = 6.0
 """The largest plausible noise of actuation and odometry, in standard deviations."""
 
 
-def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
+def with_reports(state: RobotState, reports: Sequence[Report], orbits: OrbitsOfPair) -> RobotState:
     """Return `state` with the data of `reports`, and with a verdict if a report gives reason for one.
 
-    The verdict is Inconsistent if a report is implausible, and Undecided if the peer has given up.
+    The verdict is Inconsistent if a report is implausible, and Undecided if the peer has given up. `orbits`
+    is `Planner.rendezvous` of both robots.
     """
     for received in reports:
         before, state = state, replace(state, peer_state=with_report(state.peer_state, received))
         if state.verdict is None:
             tolerance = state.estimator.report_tolerance
-            found = objection(before.peer_state, state.peer_state, received, state.config, tolerance)
+            found = objection(before.peer_state, state.peer_state, received, state.config, tolerance, orbits)
             if found is not None:
                 return state.ended(found)
     if state.verdict is None:
@@ -48,12 +53,17 @@ def with_reports(state: RobotState, reports: Sequence[Report]) -> RobotState:
 
 
 def objection(
-    before: PeerState, after: PeerState, report: Report, config: RobotConfig, tolerance: float
+    before: PeerState,
+    after: PeerState,
+    report: Report,
+    config: RobotConfig,
+    tolerance: float,
+    orbits: OrbitsOfPair,
 ) -> Inconsistent | None:
     """Return the first contradiction in `report`, which changed the peer's state from `before` to `after`.
 
-    `tolerance` is `Estimator.report_tolerance`. If it is infinite, what noise may explain is not checked. The
-    result is None if the report is plausible.
+    `tolerance` is `Estimator.report_tolerance`. If it is infinite, what noise may explain is not checked.
+    `orbits` is `Planner.rendezvous`. The result is None if the report is plausible.
     """
     without_noise = math.isfinite(tolerance)
     return (
@@ -61,7 +71,7 @@ def objection(
         or (_changed_start(before, report) if without_noise else None)
         or _exceeded_limit(report, config.mission)
         or (_ranges_off_path(before, after, config.mission, tolerance) if without_noise else None)
-        or (_off_orbit(after, report, config, tolerance) if without_noise else None)
+        or (_off_orbit(after, report, config, tolerance, orbits) if without_noise else None)
     )
 
 
@@ -140,19 +150,32 @@ def _ranges_off_path(
 
 
 def _off_orbit(
-    after: PeerState, report: Report, config: RobotConfig, tolerance: float
+    after: PeerState, report: Report, config: RobotConfig, tolerance: float, orbits: OrbitsOfPair
 ) -> Inconsistent | None:
-    """Return a contradiction if an orbiting peer is off its orbit, or does not head along it."""
-    plan = config.rendezvous
-    orbit = plan.b if config.role == "a" else plan.a
+    """Return a contradiction if an orbiting peer is off its orbit, or does not head along it.
+
+    In a group, a robot that this one visits may still be on the orbit of their first meeting, or of a retry,
+    in either role.
+    """
     if report.state != Orbiting.name or after.start is None or after.peer.through != report.tick:
         return None
     pose = after.peer.pose(after.start, report.tick, config.mission.period)
+    present = config.rendezvous.b if config.role == "a" else config.rendezvous.a
+    found = _off(present, pose, report.tick, tolerance)
+    if found is None or not config.members:
+        return found
+    earlier = orbits(config.mission, config.anchor_distance)
+    is_off = [_off(orbit, pose, report.tick, tolerance) for orbit in (earlier.a, earlier.b)]
+    return found if all(is_off) else None
+
+
+def _off(orbit: Orbit, pose: Pose, tick: int, tolerance: float) -> Inconsistent | None:
+    """Return a contradiction if `pose` is off `orbit`, or does not head along it."""
     residual = abs(math.hypot(pose.x, pose.y) - orbit.radius)
     if residual > tolerance * max(1.0, orbit.radius):
-        return Inconsistent(f"a position off its orbit at tick {report.tick}", residual)
+        return Inconsistent(f"a position off its orbit at tick {tick}", residual)
     tangent = math.copysign(0.5 * math.pi, orbit.omega)
     heading_residual = abs(wrap(pose.heading - math.atan2(pose.y, pose.x) - tangent))
     if orbit.v != 0.0 and heading_residual > tolerance:
-        return Inconsistent(f"a heading off the tangent of its orbit at tick {report.tick}", heading_residual)
+        return Inconsistent(f"a heading off the tangent of its orbit at tick {tick}", heading_residual)
     return None
