@@ -272,7 +272,7 @@ BROKEN = {
     "Idle": ("equal arguments", "command() of a new object of the class raises AttributeError"),
     "Mutable": ("equal arguments", "observe() changes the state"),
     "Unpicklable": ("equal arguments", "its state cannot be pickled"),
-    "Fast": ("the audit", "it commanded v = 1.5, expected at most 1"),
+    "Fast": ("it completes", "command() at tick 0 returns v = 1.5, expected at most 1"),
     "Stranger": ("it completes", "command() at tick 0 returns the peer nobody, expected b"),
     "NotANumber": (
         "it completes",
@@ -458,6 +458,11 @@ def test_the_largest_body_fits_a_frame_with_any_verdict(verdict: Any) -> None:
     assert report.body is not None
     assert len(report.body) == MAX_BODY_BYTES
     assert len(encode(report)) <= MAX_REPORT_BYTES
+
+
+def test_a_planner_that_is_neither_a_class_nor_a_name_is_one_line() -> None:
+    with pytest.raises(UserError, match=r"^3: expected a class, or its name$"):
+        tandem.run("paper-1", planner=3)  # type: ignore[arg-type]
 
 
 def test_orbits_that_are_none_are_one_line() -> None:

@@ -10,15 +10,13 @@ from agent.process.agent_journal import Step
 from agent.process.report_bodies import body_of
 from agent.process.robot import PlannerReplay, Robot
 from compose.audit.findings import Checks, Violation, unlike
+from compose.launch.planner_guard import beyond_limits
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
 from protocol.messages import Command, FinalReport, Message, MissionEnd, Observation, Report
 from protocol.mission import Mission
 from protocol.motion import Controls
 from protocol.wire import MalformedFrame, decode, encode
-
-LIMIT_ROUNDING = 1e-12
-"""The part of a limit by which rounding may move a quotient of a length and a period beyond it."""
 
 
 def decision(run: Run) -> Checks:
@@ -103,14 +101,8 @@ def limits(run: Run) -> Checks:
 def _within(
     tick: int, robot: str, how: str, controls: Command | Controls, mission: Mission
 ) -> Violation | None:
-    speed, turn_rate = mission.max_speed, mission.max_turn_rate
-    if abs(controls.v) > speed * (1.0 + LIMIT_ROUNDING):
-        what = f"it {how} v = {controls.v:g}, expected at most {speed:g}"
-    elif abs(controls.omega) > turn_rate * (1.0 + LIMIT_ROUNDING):
-        what = f"it {how} omega = {controls.omega:g}, expected at most {turn_rate:g}"
-    else:
-        return None
-    return Violation("limits", tick, robot, what)
+    beyond = beyond_limits(controls.v, controls.omega, mission)
+    return Violation("limits", tick, robot, f"it {how} {beyond}") if beyond is not None else None
 
 
 def log(run: Run) -> Checks:

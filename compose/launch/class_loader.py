@@ -48,12 +48,15 @@ def entry_points(group: str) -> dict[str, Any]:
     return {one.name: one for one in metadata.entry_points(group=group)}
 
 
-def name_of(cls: type) -> str:
+def name_of(cls: object) -> str:
     """Return the name MODULE:CLASS with which other processes find `cls`.
 
     A class of a script is in the module that the script's file is. One of an interactive session, such as a
-    notebook, is found only by this process. Raises UserError for a class that is not at the top level.
+    notebook, is found only by this process. Raises UserError for a class that is not at the top level, and
+    for what is no class.
     """
+    if not isinstance(cls, type):
+        raise UserError(f"{cls!r:.60}: expected a class, or its name")
     module, name = cls.__module__, cls.__qualname__
     if not name.isidentifier():
         raise UserError(f"{name}: not at the top level of a module, so other processes cannot find it")

@@ -14,11 +14,24 @@ from agent.planning.planner import Planner, Summary
 from agent.process.report_bodies import body_of, report_of
 from compose.errors import PlannerFailed
 from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
+from protocol.mission import Mission
 from protocol.orbits import Rendezvous
 from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 ANSWERS = {"command": Command, "estimate": Estimate, "summary": Summary, "rendezvous": Rendezvous}
 """The types of the answers, by method."""
+
+
+LIMIT_ROUNDING = 1e-12
+"""The part of a limit by which rounding may move a quotient of a length and a period beyond it."""
+
+
+def beyond_limits(v: float, omega: float, mission: Mission) -> str | None:
+    """Return which of two speeds (m/s, rad/s) is beyond its limit, for a user; None if both keep it."""
+    for name, value, limit in (("v", v, mission.max_speed), ("omega", omega, mission.max_turn_rate)):
+        if abs(value) > limit * (1.0 + LIMIT_ROUNDING):
+            return f"{name} = {value:g}, expected at most {limit:g}"
+    return None
 
 
 def _field_first(error: str, message: msgspec.Struct) -> str:
@@ -51,7 +64,7 @@ class GuardedPlanner(Planner[Any, Any]):
         self._name = name
         self._planner = planner
         self._robot = ""
-        self._others: tuple[str, ...] = ()
+        self._config: RobotConfig | None = None
         self._tick: int | None = None
         """The tick of the latest Observation."""
         self.decoder_error: str | None = None
@@ -63,7 +76,7 @@ class GuardedPlanner(Planner[Any, Any]):
 
     def start(self, config: RobotConfig) -> Any:
         """Return the first state."""
-        self._robot, self._others = config.robot, config.others
+        self._robot, self._config = config.robot, config
         return self._called(self._planner.start, config)
 
     def observe(self, state: Any, observation: Observation) -> Any:
@@ -121,8 +134,12 @@ class GuardedPlanner(Planner[Any, Any]):
                 why = _field_first(str(error), found)
                 raise self._failed(method, f"its {kind.__name__} cannot be sent: {why}") from None
             self._check_address(method, found)
-        if isinstance(found, Command) and found.peer not in (None, *self._others):
-            raise self._failed(method, f"returns the peer {found.peer}, expected {' or '.join(self._others)}")
+        if isinstance(found, Command) and self._config is not None:
+            others = self._config.others
+            if found.peer not in (None, *others):
+                raise self._failed(method, f"returns the peer {found.peer}, expected {' or '.join(others)}")
+            if (beyond := beyond_limits(found.v, found.omega, self._config.mission)) is not None:
+                raise self._failed(method, f"returns {beyond}")
         return found
 
     def _check_address(self, method: str, found: Any) -> None:
