@@ -90,14 +90,14 @@ def at_random(seed: int, state: TeamState) -> TeamState:
     """Return `state` with v and omega drawn uniformly; at R from its start, a robot turns back there."""
     mission, here = state.config.mission, state.odometry
     if isinstance(state.verdict, Undecided) or (state.verdict is not None and not state.waiting):
-        return state.doing_next("localised", 3, REST)
+        return state.doing_next("localised", REST)
     if math.hypot(here.x, here.y) >= mission.sensing_range:
         return state.doing_next(
-            "homing", 1, towards((0.0, 0.0), here, mission, team_tasks.ARRIVED, backward=True)
+            "homing", towards((0.0, 0.0), here, mission, team_tasks.ARRIVED, backward=True)
         )
     draw = random.Random(f"{seed}/{state.config.robot}/{state.tick}").uniform
     turn = draw(-mission.max_turn_rate, mission.max_turn_rate)
-    return state.doing_next("circling", 1, Controls(draw(0.0, mission.max_speed), turn))
+    return state.doing_next("circling", Controls(draw(0.0, mission.max_speed), turn))
 
 
 def result_of(robots: int, sigma: float, seed: int, task: Task, errors: str = "") -> Result:

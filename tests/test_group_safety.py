@@ -23,7 +23,6 @@ from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest
 from compose.recording.run import of_frames
 from compose.scenario.scenario_file import validate
-from protocol.messages import Contact
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose
 from tests.groups import localised, table_of
@@ -41,10 +40,6 @@ def group_apart(robots: int, seed: int, distance: float, sigma: float = 0.0) -> 
     return validate(table, "group.toml").scenario
 
 
-def contact(peer: str, rho: float | None) -> Contact:
-    return Contact(peer, rho, ())
-
-
 # --- one tick -----------------------------------------------------------------------------------------
 
 
@@ -52,20 +47,20 @@ def contact(peer: str, rho: float | None) -> Contact:
 def test_two_robots_that_drive_their_leeway_keep_the_distance(
     rho: float, bearing: float, other: float
 ) -> None:
-    free = leeway([contact("b", rho)], None, MISSION)
+    free = leeway({"b": rho}, MISSION)
     x = rho + free * (math.cos(other) - math.cos(bearing))
     y = free * (math.sin(other) - math.sin(bearing))
     assert math.hypot(x, y) >= MISSION.safety_distance - 1e-12
 
 
-def test_the_peer_of_the_meeting_and_robots_out_of_range_limit_nothing() -> None:
-    assert leeway([], "b", MISSION) == math.inf
-    assert leeway([contact("b", 0.6)], "b", MISSION) == math.inf
-    assert leeway([contact("b", 0.6), contact("c", 2.5)], "b", MISSION) == pytest.approx(1.0)
+def test_robots_out_of_range_limit_nothing() -> None:
+    assert leeway({}, MISSION) == math.inf
+    assert leeway({"c": 2.5}, MISSION) == pytest.approx(1.0)
+    assert leeway({"b": 0.6, "c": 2.5}, MISSION) == pytest.approx(0.05)
 
 
 def test_a_robot_stands_still_where_a_range_is_missing() -> None:
-    assert leeway([contact("c", None), contact("d", 2.5)], "b", MISSION) == 0.0
+    assert leeway({"c": None, "d": 2.5}, MISSION) == 0.0
 
 
 def test_the_way_aside_leads_back_to_one_side_and_past() -> None:
@@ -77,31 +72,37 @@ def test_the_way_aside_leads_back_to_one_side_and_past() -> None:
     assert aside(Pose(0.0, 0.0, 0.0), MISSION, -1.0)[1][1] == -beside[1]
 
 
+LITTLE = 2.0**-7
+"""A way (m) so short that a robot is blocked."""
+
+
 def ticked(passing: Bypass, free: float, v: float = 1.0, *, waits: bool = False) -> Bypass:
-    return passed(passing, Pose(0.0, 0.0, 0.0), Controls(v, 0.0), free, MISSION, waits=waits)
+    rho = MISSION.safety_distance + 2.0 * free
+    before = ["b"] if waits else []
+    return passed(passing, {"b": rho}, before, Pose(0.0, 0.0, 0.0), Controls(v, 0.0), MISSION)
 
 
 def test_a_robot_is_blocked_while_little_way_is_left_that_does_not_grow() -> None:
     passing = Bypass()
     for ticks in range(BLOCKED_AFTER - 1):
         assert passing.blocked == ticks
-        passing = ticked(passing, 0.01)
-    assert ticked(passing, 0.02).blocked == BLOCKED_AFTER - 1
+        passing = ticked(passing, LITTLE)
+    assert ticked(passing, 2.0 * LITTLE).blocked == BLOCKED_AFTER - 1
     assert ticked(passing, 0.5).blocked == 0
-    assert ticked(passing, 0.01).places[0][0] < 0.0
-    assert ticked(passing, 0.01, -1.0).places[0][0] > 0.0
-    assert ticked(passing, 0.01, 0.0).places == ()
+    assert ticked(passing, LITTLE).places[0][0] < 0.0
+    assert ticked(passing, LITTLE, -1.0).places[0][0] > 0.0
+    assert ticked(passing, LITTLE, 0.0).places == ()
 
 
 def test_one_that_waits_for_another_one_drives_aside_after_it() -> None:
-    passing = Bypass(leeway=0.01, blocked=BLOCKED_AFTER - 1)
+    passing = Bypass(leeway=LITTLE, blocked=BLOCKED_AFTER - 1)
     for _ in range(PATIENCE):
-        passing = ticked(passing, 0.01, waits=True)
+        passing = ticked(passing, LITTLE, waits=True)
         assert (passing.leeway, passing.places) == (0.0, ())
-    assert ticked(passing, 0.01, waits=True).places
+    assert ticked(passing, LITTLE, waits=True).places
 
 
-def test_robots_keep_a_reserve_but_on_a_way_aside() -> None:
+def test_robots_keep_a_reserve_but_on_a_aside() -> None:
     ahead, least = Controls(1.0, 0.0), RESERVE * MISSION.first_straight
     assert limited(ahead, Bypass(leeway=least), MISSION).v == 0.0
     assert limited(ahead, Bypass(leeway=least, places=((1.0, 0.0),)), MISSION).v == least

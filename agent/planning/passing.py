@@ -11,7 +11,7 @@ smallest id never waits. The others wait for a few ticks at most: that one may n
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 from msgspec.structs import replace
 
@@ -51,24 +51,26 @@ With 60, groups take as long.
 
 
 def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
-    """Return `state` on its way past the robots in contact that it does not meet, after a tick."""
+    """Return `state` on its way past the robots in contact that it does not meet, after a tick.
+
+    A peer that does not go on with the meeting is passed like any other robot.
+    """
     mission, passing, task = state.config.mission, state.agenda.passing, state.task
     if not mission.safety_distance:
         return state
-    peer = state.config.peer if state.in_contact else None
-    free = leeway(contacts, peer, mission)
-    of_smaller_ids = leeway([one for one in contacts if one.peer < state.config.robot], peer, mission)
+    met = state.config.peer if state.in_contact else None
+    ranges = {one.peer: one.range for one in contacts if one.peer != met}
     stays = isinstance(task, Orbiting) and state.config.orbit.v == 0.0
     if stays or not isinstance(task, Travelling | Orbital):
-        return state.with_agenda(passing=Bypass(free, detours=passing.detours))
+        return state.with_agenda(passing=Bypass(leeway(ranges, mission), detours=passing.detours))
     if passing.places:  # what it does after the way aside begins where that ends
         on_visit = isinstance(task, Travelling)
         state = state.doing(Travelling(visit.stop(state)) if on_visit else phase2_orbit.aligning(state))
         if drive.way_to(state, passing.places[0], backward=True) is None:
             passing = replace(passing, places=passing.places[1:])
             state = state.with_agenda(passing=passing)
-    waits = separation.is_tight(of_smaller_ids, mission)
-    after = passed(passing, state.odometry, drive.controls(state), free, mission, waits=waits)
+    before = [one for one in ranges if one < state.config.robot]
+    after = passed(passing, ranges, before, state.odometry, drive.controls(state), mission)
     if after.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
         after = replace(after, places=after.places[:2])  # its next task leads past the other robot
     return state.with_agenda(passing=after)
@@ -81,31 +83,32 @@ def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:
     return separation.slowed(controls, max(0.0, passing.leeway - reserve), mission)
 
 
-def leeway(contacts: Sequence[Contact], peer: str | None, mission: Mission) -> float:
-    """Return how far in m a robot may drive in the next tick, for all robots in contact but its `peer`.
-
-    `peer` is None if it does not go on with the meeting: then the robot passes it like any other.
-    """
-    free = [
-        0.0 if one.range is None else separation.leeway_of_each(one.range, mission)
-        for one in contacts
-        if one.peer != peer
-    ]
+def leeway(ranges: Mapping[str, float | None], mission: Mission) -> float:
+    """Return how far in m a robot may drive in the next tick for the robots at these `ranges`."""
+    free = [0.0 if rho is None else separation.leeway_of_each(rho, mission) for rho in ranges.values()]
     return min(free, default=math.inf)
 
 
 def passed(
-    passing: Bypass, here: Pose, controls: Controls, free: float, mission: Mission, *, waits: bool
+    passing: Bypass,
+    ranges: Mapping[str, float | None],
+    before: Collection[str],
+    here: Pose,
+    controls: Controls,
+    mission: Mission,
 ) -> Bypass:
-    """Return `passing` after a tick that led `here`, if `free` m of the next `controls` may be driven.
+    """Return `passing` after a tick that led `here`, at `ranges` (m) from others.
 
-    While `free` is little but grows, one of the two robots drives away from the other, and none is blocked.
-    A blocked robot drives aside, but stands still first if it `waits` for another one to do so.
+    `controls` are the next ones. While little way is left but grows, one of two robots drives away from the
+    other, and none is blocked. A blocked robot drives aside, but stands still first for those that come
+    `before` it.
     """
+    free = leeway(ranges, mission)
     blocked = passing.blocked + (free <= passing.leeway) if separation.is_tight(free, mission) else 0
     yielded = passing.yielded if math.isfinite(free) else 0
     if blocked < (BLOCKED_ASIDE_AFTER if passing.places else BLOCKED_AFTER) or controls.v == 0.0:
         return replace(passing, leeway=free, blocked=blocked, yielded=yielded)
+    waits = separation.is_tight(leeway({one: ranges[one] for one in before}, mission), mission)
     if waits and yielded < PATIENCE:
         return replace(passing, leeway=0.0, blocked=blocked, yielded=yielded + 1)
     course = here if controls.v > 0.0 else compose(here, Pose(0.0, 0.0, math.pi))

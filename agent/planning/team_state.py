@@ -28,6 +28,9 @@ from protocol.sweep_strips import Place
 UNMET = "it has reported nothing"
 """The reason against a claim by the measurements of a robot that there are none of."""
 
+PHASES = {"searching": 2, "orbiting": 2, "surveying": 3, "localised": 3, "undecided": 3}
+"""The phase of the paper to which a task corresponds; 1 for all others."""
+
 MOST_SIGMA = 1e6
 """The largest sigma (m) of an anchor that is stated."""
 
@@ -118,8 +121,6 @@ class TeamState(msgspec.Struct, frozen=True):
     """The search for robots that start elsewhere."""
     doing: str = "asleep"
     """The name of the present task."""
-    phase: int = 1
-    """The phase of the paper to which it corresponds."""
     controls: Controls = REST
     """The controls of the next tick."""
     planned: int = -1
@@ -175,9 +176,14 @@ class TeamState(msgspec.Struct, frozen=True):
         """True if another robot in contact has no result, as far as this one knows."""
         return any(self.team.robots[one] in self.apart for one in self.waiting)
 
-    def doing_next(self, doing: str, phase: int, controls: Controls | None) -> TeamState:
+    @property
+    def phase(self) -> int:
+        """The phase of the paper to which the task corresponds."""
+        return PHASES.get(self.doing, 1)
+
+    def doing_next(self, doing: str, controls: Controls | None) -> TeamState:
         """Return this with another task, and its controls; None: it stands still."""
-        return replace(self, doing=doing, phase=phase, controls=controls or REST)
+        return replace(self, doing=doing, controls=controls or REST)
 
 
 def followed(state: TeamState) -> TeamState:

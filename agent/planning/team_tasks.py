@@ -19,9 +19,7 @@ from agent.estimation.gaussian.odometry_noise import Array, track
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.posterior import Hypothesis
-from agent.planning import separation
 from agent.planning.active_sensing import AmongBeacons, plan_among
-from agent.planning.agenda import Bypass
 from agent.planning.drive import pursuit, towards
 from agent.planning.passing import limited, passed
 from agent.planning.strides import stride
@@ -67,43 +65,41 @@ def next_task(state: TeamState) -> TeamState:
 
 def _passing_robots(state: TeamState) -> TeamState:
     """Return `state` on its way past robots (see `passing`). It waits for those earlier in the team."""
-    mission, here, own = state.config.mission, state.odometry, state.own
+    mission, passing = state.config.mission, state.passing
     if not mission.safety_distance:
         return state
-    free = {one: separation.leeway_of_each(rho, mission) for one, rho in state.apart.items()}
-    of_earlier = [left for one, left in free.items() if state.team.robots.index(one) < own]
-    passing, least = state.passing, min(free.values(), default=math.inf)
-    if passing.places and _aside(passing, state) is None:
+    if passing.places and _aside(state) is None:
         passing = replace(passing, places=passing.places[1:])
-    controls = _aside(passing, state) or state.controls
-    waits = any(separation.is_tight(left, mission) for left in of_earlier)
-    return replace(state, passing=passed(passing, here, controls, least, mission, waits=waits))
+        state = replace(state, passing=passing)
+    earlier = [one for one in state.team.robots[: state.own] if one in state.apart]
+    controls = _aside(state) or state.controls
+    return replace(state, passing=passed(passing, state.apart, earlier, state.odometry, controls, mission))
 
 
 def safe_controls(state: TeamState) -> Controls:
     """Return the controls of the task, or aside of it, at a speed that keeps the safety distance."""
-    return limited(_aside(state.passing, state) or state.controls, state.passing, state.config.mission)
+    return limited(_aside(state) or state.controls, state.passing, state.config.mission)
 
 
-def _aside(passing: Bypass, state: TeamState) -> Controls | None:
+def _aside(state: TeamState) -> Controls | None:
     """Return the controls to the next place of the way aside; None at that place, or on no such way."""
-    if not passing.places:
+    if not state.passing.places:
         return None
-    return towards(passing.places[0], state.odometry, state.config.mission, ARRIVED, backward=True)
+    return towards(state.passing.places[0], state.odometry, state.config.mission, ARRIVED, backward=True)
 
 
 def _at_rest(state: TeamState) -> TeamState | None:
     """Return `state` at rest at the end: it is undecided, or nobody waits for a result."""
     if isinstance(state.verdict, Undecided):
-        return state.doing_next("undecided", 3, None)
-    return state.doing_next("localised", 3, None) if state.verdict and not state.waiting else None
+        return state.doing_next("undecided", None)
+    return state.doing_next("localised", None) if state.verdict and not state.waiting else None
 
 
 def _as_beacon(state: TeamState) -> TeamState | None:
     """Return `state` with a claim: in loops while a robot in contact has no result. The origin goes on."""
     if state.verdict is None or state.config.robot == state.team.origin:
         return None
-    return state.doing_next("localised", 3, _loop(state) if state.waiting_here else None)
+    return state.doing_next("localised", _loop(state) if state.waiting_here else None)
 
 
 def _searching(state: TeamState) -> TeamState | None:
@@ -115,7 +111,7 @@ def _searching(state: TeamState) -> TeamState | None:
     if not (state.team.diameter and state.waiting and _alone(state)):
         return None
     if state.config.robot != state.team.origin:
-        return state.doing_next("waiting", 1, None)
+        return state.doing_next("waiting", None)
     mission, here, (corner, place) = state.config.mission, state.odometry, state.spiral
     corners, v = spiral(mission, state.team.diameter), sweep_speed(mission)
     if math.hypot(here.x - place[0], here.y - place[1]) <= (1.0 + ARRIVED) * v * mission.period:
@@ -126,7 +122,7 @@ def _searching(state: TeamState) -> TeamState | None:
         if way is not None:
             break
     controls = Controls(min(way.v, v), way.omega) if way is not None else None
-    return replace(state, spiral=Spiral(k, place)).doing_next("searching", 2, controls)
+    return replace(state, spiral=Spiral(k, place)).doing_next("searching", controls)
 
 
 def _alone(state: TeamState) -> bool:
@@ -158,7 +154,7 @@ def _returning(state: TeamState) -> TeamState | None:
 
 def _homing(state: TeamState, place: Pose) -> TeamState:
     way = towards((place.x, place.y), state.odometry, state.config.mission, ARRIVED, backward=True)
-    return state.doing_next("homing", 1, way)
+    return state.doing_next("homing", way)
 
 
 def _arrived(state: TeamState) -> TeamState:
@@ -191,7 +187,7 @@ def _lost(state: TeamState) -> Pose | None:
 
 
 def _circling(state: TeamState) -> TeamState:
-    return state.doing_next("circling", 1, _loop(state))
+    return state.doing_next("circling", _loop(state))
 
 
 def _loop(state: TeamState) -> Controls:
@@ -241,7 +237,7 @@ def _looping(state: TeamState) -> TeamState | None:
 def _passing(state: TeamState) -> TeamState | None:
     """Return `state` on the way past another anchor, once there is one."""
     way = _way(state)
-    return replace(state, way=way).doing_next("orbiting", 2, _along(state, way)) if way is not None else None
+    return replace(state, way=way).doing_next("orbiting", _along(state, way)) if way is not None else None
 
 
 def _way(state: TeamState) -> Way | None:
@@ -291,14 +287,14 @@ def _surveying(state: TeamState) -> TeamState | None:
     if not seen or not len(seen[0].beacons):
         return None
     if (controls := _to_anchor(state)) is not None:
-        return state.doing_next("surveying", 3, controls)
+        return state.doing_next("surveying", controls)
     if state.doing == "surveying" and state.tick < state.planned + stride(mission):
         return state
     sigma = max(mission.noise.anchor_sigma, mission.noise.mutual_sigma)
     if state.team.origin is not None and (own := state.following.judged.get(state.config.robot)):
         mission = replace(mission, accuracy=own.accuracy)  # with exact sensors, that of rounding
     controls = plan_among(seen, sigma, mission, _frame_sigma(state))
-    return replace(state, planned=state.tick).doing_next("surveying", 3, controls)
+    return replace(state, planned=state.tick).doing_next("surveying", controls)
 
 
 def _to_anchor(state: TeamState) -> Controls | None:
