@@ -152,10 +152,8 @@ class Agenda(msgspec.Struct, frozen=True):
     """True if the robot waits at its anchor for a visitor, or drives there to wait, or has no anchor."""
     visiting: bool = False
     """True if the present meeting is a visit: the robot knows its pose already."""
-    unmet: int = 0
-    """The number of consecutive ticks out of range of the peer since this robot's verdict in the meeting."""
-    lingering: int = 0
-    """The number of consecutive ticks in range of the peer since the end of their meeting."""
+    parting: int = 0
+    """The number of consecutive ticks since its verdict in the meeting with contact, or without, as now."""
     silence: int = 0
     """The number of consecutive ticks in range of the peer without a log of it."""
     passing: Bypass = Bypass()

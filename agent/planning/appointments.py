@@ -170,7 +170,7 @@ def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | N
         peer_state=PeerState(),
         task=Asleep(),
         plan=None,
-    ).with_agenda(meeting=state.agenda.meeting + 1, alone=False, visiting=False, unmet=0, silence=0)
+    ).with_agenda(meeting=state.agenda.meeting + 1, alone=False, visiting=False, parting=0, silence=0)
 
 
 def parted(state: RobotState, failure: Verdict | None = None) -> RobotState:

@@ -75,6 +75,20 @@ def with_pose(state: RobotState, peer: str, report: Report) -> Report:
     return replace(report, since=since, through=part.through, runs=part.runs, prior=reference)
 
 
+def beacon(state: RobotState) -> str | None:
+    """Return the peer of a robot that sweeps, or this robot if it is a beacon; None if there is none.
+
+    A beacon stays where it is: it sweeps no part, and its planned meetings are over.
+    """
+    config, agenda = state.config, state.agenda
+    if state.sweeps:
+        return config.peer
+    if config.sweep is None or config.part < config.sweep.parts or agenda.visits < len(config.visits):
+        return None
+    is_known = isinstance(state.verdict, Localised) and isinstance(agenda.robot_verdict, Localised)
+    return config.robot if is_known else None
+
+
 def begun(state: RobotState, part: int) -> RobotState:
     """Return `state` at the begin of the sweep of a part. A beacon sweeps none, and stays where it is."""
     config, fix = state.config, state.agenda.fix

@@ -74,12 +74,9 @@ class GroupPlanner(Planner[RobotState, Report]):
         state = passing.onward(state, observation.contacts)
         if isinstance(state.task, Travelling) and not state.in_contact and not state.agenda.passing.places:
             state = visit.searching(state)
-        ended, agenda = isinstance(state.task, Done), state.agenda
-        unmet = agenda.unmet + 1 if ended and not state.in_contact else 0
-        lingering = agenda.lingering + 1 if ended and state.in_contact else 0
-        if (unmet, lingering) == (agenda.unmet, agenda.lingering):
-            return state
-        return state.with_agenda(unmet=unmet, lingering=lingering)
+        lasting = state.agenda.parting if state.in_contact == before.in_contact else 0
+        parting = lasting + 1 if isinstance(state.task, Done) else 0
+        return state if parting == state.agenda.parting else state.with_agenda(parting=parting)
 
     def report(self, state: RobotState) -> Report:
         """Return the report to the peer of the present meeting."""
@@ -96,7 +93,7 @@ class GroupPlanner(Planner[RobotState, Report]):
             return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):
             report = exchange.report_without_log(state, state.agenda.failure)
-        elif peer == state.config.peer and (state.meets or searching.has_beacon(state)):
+        elif (state.meets and peer == state.config.peer) or peer == searching.beacon(state):
             return self.report(state)
         else:
             report = searching.outside_meeting(state, peer)

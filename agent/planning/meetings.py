@@ -135,15 +135,15 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
     if not isinstance(state.task, Done) or _must_linger(state):
         return state
     if not isinstance(state.verdict, Localised):
-        reported = agenda.lingering > 0 or not state.in_contact  # to the peer, before this robot leaves
+        reported = agenda.parting > 0 or not state.in_contact  # to the peer, before this robot leaves
         return appointments.next_visit(appointments.parted(state)) if reported else state
     return appointments.next_visit(state) if over else state
 
 
 def _is_over(state: RobotState) -> bool:
     """Return whether the peer has a result in the present meeting, or is not there any more."""
-    has_left = state.agenda.unmet >= PARTED_AFTER or appointments.is_silent(state)
-    return has_left or state.peer_state.verdict is not None
+    has_left = state.agenda.parting >= PARTED_AFTER and not state.in_contact
+    return has_left or appointments.is_silent(state) or state.peer_state.verdict is not None
 
 
 def rests(state: RobotState) -> bool:
@@ -160,6 +160,5 @@ def _must_linger(state: RobotState) -> bool:
     """
     if not state.config.mission.safety_distance or state.config.role == "a" or not state.in_contact:
         return False
-    if state.other(state.config.peer).travels:
-        return state.agenda.lingering < appointments.PEER_LOST_AFTER
-    return state.agenda.lingering < LINGERING
+    travels = state.other(state.config.peer).travels
+    return state.agenda.parting < (appointments.PEER_LOST_AFTER if travels else LINGERING)

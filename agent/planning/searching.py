@@ -28,16 +28,14 @@ class SweepSteps(NamedTuple):
     """The function that begins the sweep of a part of the area."""
     after_tick: Callable[[RobotState, Sequence[str]], RobotState]
     """The function that advances a sweep by a tick, with the robots that it may help."""
-    has_beacon: bool
-    """True if the robot that was visited last stays where it is, so that the sweeping one knows its pose.
-
-    Robots that were found then take no part: they have no anchor and no beacon that correct their odometry.
-    """
+    beacon: Callable[[RobotState], str | None]
+    """The function that returns the robot which stays where it is, so that one that sweeps knows its pose:
+    that robot's latest peer, or this robot; None if there is none."""
 
 
-DEAD_RECKONED = SweepSteps(Resected(), sweep.with_pose, sweep.begun, sweep.after_tick, has_beacon=False)
+DEAD_RECKONED = SweepSteps(Resected(), sweep.with_pose, sweep.begun, sweep.after_tick, lambda _: None)
 CORRECTED = SweepSteps(
-    Contacted(), beacon_sweep.with_pose, beacon_sweep.begun, beacon_sweep.after_tick, has_beacon=True
+    Contacted(), beacon_sweep.with_pose, beacon_sweep.begun, beacon_sweep.after_tick, beacon_sweep.beacon
 )
 
 
@@ -61,28 +59,21 @@ def is_helped(state: RobotState, robot: str) -> bool:
 def takes_part(state: RobotState) -> bool:
     """Return whether a robot without an anchor is localised, and looks for the others that have none.
 
-    If robots may report false data, its pose is not independent of those that have found it.
+    One whose odometry ranges have to correct does not: it has no anchor and no beacon. If robots may report
+    false data, its pose is not independent of those that have found it.
     """
-    shares = not (steps_of(state).has_beacon or state.config.tolerates)
+    shares = not (state.estimator.corrects_poses or state.config.tolerates)
     return shares and isinstance(state.agenda.robot_verdict, Localised)
 
 
-def has_beacon(state: RobotState) -> bool:
-    """Return whether the robot sweeps with its latest peer as a beacon, which goes on to get its log."""
-    return state.sweeps and steps_of(state).has_beacon
+def beacon(state: RobotState) -> str | None:
+    """Return the robot that stays where it is for one that sweeps: the peer, this robot, or None."""
+    return steps_of(state).beacon(state)
 
 
 def is_apart(state: RobotState) -> bool:
-    """Return whether the robot is in no meeting any more: it sweeps, or is the beacon of one that does.
-
-    A beacon stays where it is: it sweeps no part, and its planned meetings are over.
-    """
-    config, agenda = state.config, state.agenda
-    if state.sweeps or config.sweep is None or not steps_of(state).has_beacon:
-        return state.sweeps
-    if config.part < config.sweep.parts or agenda.visits < len(config.visits):
-        return False
-    return isinstance(state.verdict, Localised) and isinstance(agenda.robot_verdict, Localised)
+    """Return whether the robot is in no meeting any more: it sweeps, or is the beacon of one that does."""
+    return state.sweeps or beacon(state) == state.config.robot
 
 
 def outside_meeting(state: RobotState, peer: str) -> Report:
@@ -108,7 +99,7 @@ def next_part(state: RobotState) -> RobotState:
         state = state.with_other(robot, failed=False)
     part = (config.part + state.agenda.parts) % config.sweep.parts
     state = state.with_agenda(
-        parts=state.agenda.parts + 1, part_tick=state.tick, visiting=False, unmet=0, silence=0
+        parts=state.agenda.parts + 1, part_tick=state.tick, visiting=False, parting=0, silence=0
     )
     return steps_of(state).begun(state, part)
 
