@@ -141,10 +141,6 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
     return separation.slowed(controls, separation.leeway_of_each(state.mutual[-1].range, mission), mission)
 
 
-KEPT_PLACES = 3
-"""The number of relative placements that a claim from exact ranges needs; two leave several solutions."""
-
-
 class Steps(NamedTuple):
     """The steps of a planner that depend on the sensors: chosen once, by the estimator."""
 
@@ -171,7 +167,8 @@ class LogPlanner(Planner[RobotState, Report]):
     """The steps of a robot whose pose each range corrects."""
     SOLVER: Solver | None = None
     """The solver that fits the poses under noise; None for the smoother. A subclass may choose its own."""
-    REQUIRED_PLACES = KEPT_PLACES
+    REQUIRED_PLACES = 3
+    """Two leave several solutions."""
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet."""

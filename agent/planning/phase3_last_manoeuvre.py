@@ -171,33 +171,19 @@ def _keeps_apart(question: Question, reach: ReachableEnds, mission: Mission) -> 
     mover, a, b, candidates = question
     v, omega = np.broadcast_arrays(reach.v, reach.omega)
     here = a if mover == "a" else b
-    least = [
-        nearest(here, v, omega, _standing_position(mover, a, b, candidate), mission.period)
-        for candidate in candidates
-    ]
+    others = [one.place(a) if mover == "b" else relative(one.frame, b) for one in candidates]
+    least = [nearest(here, v, omega, (other.x, other.y), mission.period) for other in others]
     allowed: NDArray[np.bool] = np.min(least, axis=0) >= mission.safety_distance
     return allowed
 
 
-def _standing_position(mover: Role, a: Pose, b: Pose, placement: Placement) -> tuple[float, float]:
-    """Return the position of the robot that does not move, in the frame of the mover's anchor."""
-    there = placement.place(a) if mover == "b" else relative(placement.frame, b)
-    return there.x, there.y
-
-
 def _plan(question: Question, reach: ReachableEnds, value: Array, gap: Array | None = None) -> Plan | None:
     """Return the manoeuvre in `reach` with the largest `value`, and its `gap`; None if none is allowed."""
-    row, column = _best(value)
+    row, column = divmod(int(np.argmax(value)), value.shape[1])  # the first one of several
     if value[row, column] == -np.inf:
         return None
     command = Controls(float(reach.v[row, 0]), float(reach.omega[column]))
     return Plan(command, None if gap is None else float(gap[row, column]), question)
-
-
-def _best(value: Array) -> tuple[int, int]:
-    """Return the row and the column of the largest value; the first one of several."""
-    row, column = divmod(int(np.argmax(value)), value.shape[1])
-    return row, column
 
 
 def reachable(pose: Pose, mission: Mission, speeds: tuple[float, ...] | None) -> ReachableEnds:

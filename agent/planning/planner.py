@@ -183,8 +183,3 @@ class Manoeuvres(msgspec.Struct, frozen=True):
 
     No detection selects those placements.
     """
-
-    @property
-    def backward(self) -> bool:
-        """Return whether the robot also drives backward."""
-        return -1.0 in self.directions

@@ -30,22 +30,18 @@ def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoe
     distance_tolerance = tolerance * state.config.mission.first_straight
     step = drive.step_length(task.beacon, task.rho0, state.config.mission)
     match task:
-        case Straight(beacon, origin, rho0):
-            is_short = travelled(origin, pose) < step - distance_tolerance
+        case Straight(beacon, origin, rho0) | Backing(beacon, origin, rho0):
+            ahead = isinstance(task, Straight)
+            driven = travelled(origin, pose) if ahead else -relative(origin, pose).x
+            is_short = driven < step - distance_tolerance
             if is_short and not _is_blocked(state):
                 return task
             if measured and not is_short:
                 return None
-            if manoeuvres.backward:
+            if ahead and -1.0 in manoeuvres.directions:
                 return Backing(beacon, origin, rho0)
-            return Turning(beacon, origin, rho0, pose.heading + math.pi / 2)
-        case Backing(beacon, origin, rho0):
-            is_short = relative(origin, pose).x > distance_tolerance - step
-            if is_short and not _is_blocked(state):
-                return task
-            if measured and not is_short:
-                return None
-            return Turning(beacon, origin, rho0, pose.heading - math.pi / 2)
+            side = 0.5 * math.pi if ahead else -0.5 * math.pi
+            return Turning(beacon, origin, rho0, pose.heading + side)
         case Turning(beacon, origin, rho0, heading):
             return task if abs(heading - pose.heading) > tolerance else Circling(beacon, origin, rho0)
         case _:

@@ -24,14 +24,12 @@ from agent.planning.tasks import Awaiting, Done, Sweeping
 from protocol.messages import Estimate, Localised, Report, RobotConfig
 from protocol.mission import Mission
 
-FEWEST_PLACES = 5
-"""The number of relative placements that a claim needs: three for a position, two for a heading."""
-
 
 class UnanchoredPlanner(LogPlanner):
     """The planner of a robot without an anchor: `GroupPlanner` asks it to decide in the one meeting."""
 
-    REQUIRED_PLACES = FEWEST_PLACES
+    REQUIRED_PLACES = 5
+    """Three for a position, two for a heading."""
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet. Raises NoKernel."""
