@@ -9,8 +9,8 @@ from msgspec.structs import replace
 
 from agent.planning import tasks
 from agent.planning.planner import Planner
-from agent.planning.registry import PLANNER_CLASSES
 from agent.planning.state import RobotState
+from compose.launch.planner_loader import planner_class
 from compose.scenario.scenario_file import load
 from protocol.messages import Command, Observation, Report
 from world.scenario import Scenario
@@ -37,7 +37,7 @@ class Step(NamedTuple):
 
 def planner_of(state: RobotState) -> Planner[RobotState, Report]:
     """Return the planner of the robot with this state."""
-    return PLANNER_CLASSES[state.config.planner_name]()
+    return planner_class(state.config.planner_name)()
 
 
 def steps(scenario: str | Scenario, *, at_rest: int = 0) -> Iterator[Step]:
@@ -46,7 +46,7 @@ def steps(scenario: str | Scenario, *, at_rest: int = 0) -> Iterator[Step]:
     In the first `at_rest` ticks, all robots miss the deadline.
     """
     world = release(load(scenario) if isinstance(scenario, str) else scenario)
-    play = PLANNER_CLASSES[world.scenario.planner_name]()
+    play = planner_class(world.scenario.planner_name)()
     states = {robot.id: play.start(world.scenario.config(robot.id)) for robot in world.scenario.robots}
     while True:
         sensed = observations(world)

@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import msgspec
 
+from compose.launch.planner_loader import is_shipped, planner_class
 from compose.recording.run_setup import RunSetup
 from compose.view.pair_data import PairData
 from compose.view.run_data import TickData
@@ -120,10 +121,9 @@ def _compared(
 ) -> ComparedManoeuvre | None:
     from agent.estimation.closed_forms import Placement  # noqa: PLC0415  # numpy, for few ticks only
     from agent.planning.phase3_last_manoeuvre import Question, compared  # noqa: PLC0415
-    from agent.planning.registry import PLANNER_CLASSES  # noqa: PLC0415
 
-    planner = PLANNER_CLASSES.get(setup.planner_name)
-    manoeuvres = planner.MANOEUVRES if planner is not None else None
+    name = setup.planner_name
+    manoeuvres = planner_class(name).MANOEUVRES if is_shipped(name) else None
     if manoeuvres is None:
         return None
     relative = [compose(inverse(b), a) for a, b in poses]
