@@ -27,7 +27,6 @@ from agent.estimation.gaussian import planning_hypotheses
 from agent.peer import peer_state
 from agent.planning import phase3_encounter
 from agent.process import node
-from compose.recording import run
 from compose.scenario import group_meetings
 from compose.sweep.hunt.exploration import FoundBreach, Hunt
 from compose.sweep.hunt.mutation import fault_lines
@@ -46,13 +45,18 @@ BEGIN, END = "<!-- written by tests/mutants.py -->", "<!-- end of mutants -->"
 
 
 def edited(owner: Any, name: str, old: str, new: str) -> None:
-    """Replace `old`, which must be there, by `new` in the source of the function `name` of `owner`."""
+    """Replace `old`, which must be there, by `new` in the source of the function `name` of `owner`.
+
+    Modules that have imported the function get the new one, too.
+    """
     function = vars(owner)[name]
     source = textwrap.dedent(inspect.getsource(function))
     assert source.count(old) == 1, source
     namespace: dict[str, Any] = {}
     exec(compile(source.replace(old, new), f"{name}, mutated", "exec"), function.__globals__, namespace)
-    setattr(owner, name, namespace[name])
+    for one in (owner, *sys.modules.values()):
+        if vars(one).get(name) is function:
+            setattr(one, name, namespace[name])
 
 
 def unflushed() -> None:
@@ -111,7 +115,6 @@ def kept() -> None:
         "if command is None or command.verdict == given",
         "if command is None or command.verdict is None or command.verdict == given",
     )
-    vars(run)["verdicts_after"] = tick.verdicts_after
 
 
 def lost() -> None:

@@ -22,9 +22,11 @@ from agent.process.node import AgentProcess
 from compose.audit import rules
 from compose.cli import hunt as command
 from compose.cli.main import parse
+from compose.errors import UserError
 from compose.launch import in_process, virtual_processes
 from compose.recording import run
 from compose.recording.run import of_frames
+from compose.scenario import first_meetings, group_meetings
 from compose.scenario.kills import KILL_POINTS
 from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
@@ -33,7 +35,16 @@ from compose.sweep.cells import cells
 from compose.sweep.hunt import coverage, examination
 from compose.sweep.hunt.examination import MOST_TICKS, MOST_WITHOUT_END, examined, scenario_of, watched
 from compose.sweep.hunt.exploration import Hunt
-from compose.sweep.hunt.mutation import fault_lines, joined, simpler
+from compose.sweep.hunt.mutation import (
+    MOST_KILLS,
+    Clues,
+    fault_lines,
+    joined,
+    kills_added,
+    mutated,
+    robots_of,
+    simpler,
+)
 from compose.sweep.hunt.mutation import seeds as hunted
 from protocol.journal.journal_file import CorruptJournal, MemoryJournal, packed
 from protocol.messages import Observation
@@ -178,7 +189,46 @@ def test_an_input_gets_faults_and_kills_of_another_one() -> None:
     assert {len(one.get("fault", [])) + 2 * len(one.get("kill", [])) for one in made} == {0, 1, 2, 3}
     assert {one["mission"].get("accuracy") for one in made} == {None, 0.3}
     assert "noise" not in table["mission"]
-    assert joined(table, scenario_table("noisy") | {"robot": []}, draw) is table
+    assert joined(table, {**other, "kill": [{"who": "c"}], "fault": [{"link": "a<->c"}]}, draw)["robot"]
+
+
+def test_an_input_names_only_robots_that_it_has() -> None:
+    draw, table = random.Random(1), scenario_table("random-group")
+    many = {**table, "group": {"robots": 8, "spacing": 30.0}, "kill": [{"who": ["r7", "r2"], "tick": 3}]}
+    many |= {"fault": [{"link": "r7->r2", "loss": 0.5}], "clock": [{"who": "r8", "offset": 1.0}]}
+    known, reasons = Clues(tuple(robots_of(many))), set[str]()
+    for one, other in [(table, many), (many, table)] * 100:
+        made = joined(one, other, draw)
+        for _ in range(5):
+            made = mutated(made, known, draw)
+        reasons.add(refused_for(made))
+    assert {one for one in reasons if "who" in one or "link" in one} == set()
+
+
+def refused_for(table: dict[str, Any]) -> str:
+    """Return the reason why `table` is no mission; "" if it is one."""
+    try:
+        scenario_of(table)
+    except UserError as error:
+        return str(error)
+    return ""
+
+
+def test_a_process_is_killed_at_one_point_of_ticks_in_turn() -> None:
+    draw, known = random.Random(1), Clues(("a", "b"), 40, (20,))
+    made = [kills_added(scenario_table("random"), known, draw) for _ in range(50)]
+    ticks = [[kill["tick"] for kill in one["kill"]] for one in made if one is not None]
+    assert any(one == [*range(one[0], one[0] + MOST_KILLS)] for one in ticks if len(one) == MOST_KILLS)
+
+
+def test_a_mutant_takes_the_place_of_a_function_wherever_it_is_imported(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    before = group_meetings.group_meetings
+    for module in (group_meetings, first_meetings):
+        monkeypatch.setattr(module, "group_meetings", before)  # restored after the test
+    mutants.bound()
+    assert vars(first_meetings)["group_meetings"] is group_meetings.group_meetings is not before
 
 
 def test_an_input_reaches_the_same_after_another_one(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -89,7 +89,10 @@ def examined(table: dict[str, Any], seen: Set[str] | None = None) -> Examined:
         events = {one for one in found if one.rpartition(": ")[2] in DISTURBED}
         events |= {f"killed: {kill.who == 'world'} {kill.point} {_task(run, kill)}" for kill in kills}
         alone = not (kills or scenario.faults or scenario.deaths)  # then it also runs in hardware mode
-        events |= {f"clock: {alone} {who == 'world'} {one.offset} {one.drift}" for who, one in clocks.items()}
+        events |= {
+            f"clock: {alone} {who == 'world'} {sorted({by for _, by in one.jumps})}"
+            for who, one in clocks.items()
+        }
         found |= conditions | events
         known = seen or frozenset()
         in_turn = seen is None or crc32(msgspec.json.encode(table)) % FULL_EACH == 0
@@ -126,10 +129,12 @@ def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal
 
 
 def _task(run: Run, kill: Kill) -> str:
-    """Return the task of the killed robot, or of the first one, in the tick of `kill`."""
+    """Return the task of the killed robot, or of the first one, in the tick of `kill`; and if in contact."""
     robot = kill.who if kill.who in run.robots else run.robots[0]
     command = run.command(robot, kill.tick) if kill.tick < run.length else None
-    return command.task if command is not None else "over"
+    if command is None:
+        return "over"
+    return command.task if run.contact(robot, kill.tick) is None else f"{command.task} in contact"
 
 
 def _again(

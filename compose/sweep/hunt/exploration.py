@@ -26,6 +26,7 @@ from compose.sweep.hunt.mutation import (
     is_noisy,
     joined,
     mutated,
+    robots_of,
     seeds,
     simpler,
 )
@@ -59,7 +60,10 @@ FIXED_TICKS = 25
 Without it, missions of a few ticks are changed most often, in which kills and faults meet nothing.
 """
 SEEDS_SHARE = 0.2
-"""The share of inputs that are changes of the first ones, of which more and more are taken."""
+"""The share of inputs that are changes of the first ones, of which more and more are taken.
+
+One that takes 100 times as long is changed a tenth as often.
+"""
 LONG_TICKS = 300
 """The ticks from which on most of the time grows with the square of the ticks.
 
@@ -98,6 +102,8 @@ class Hunt:
         """`guided` is whether inputs that reach something new are kept; otherwise, chance alone decides."""
         self.seeds = seeds(source)
         """The inputs with which the hunt begins, the source first."""
+        self._first = [CorpusEntry(one, Clues(tuple(robots_of(one)), 100)) for one in self.seeds]
+        """These inputs, with what their runs have shown."""
         self._seed, self._workers, self._guided = seed, workers, guided
         self.corpus: list[CorpusEntry] = []
         """The inputs that reached something new."""
@@ -145,9 +151,9 @@ class Hunt:
     def _input(self, draw: random.Random) -> Table:
         """Return a mutation of an input of the corpus, or of one of the first inputs: by chance, always."""
         if not self._guided or not self.corpus or draw.random() < SEEDS_SHARE:
-            one = draw.choice(self.seeds[: 1 + len(self.corpus)] if self._guided else self.seeds)
-            known = Clues(tuple([robot.id for robot in scenario_of(one)[0].robots]), 100)
-            return mutated(one, known, draw)
+            firsts = self._first[: 1 + len(self.corpus)] if self._guided else self._first
+            [first] = draw.choices(firsts, [math.sqrt(one.share) if self._guided else 1.0 for one in firsts])
+            return mutated(first.table, first.known, draw)
         if self.slowest:
             near = [*self.slowest.values()]
             [(_, entry)] = draw.choices(near, [share**NEARER * one.share for share, one in near])
@@ -159,6 +165,8 @@ class Hunt:
 
     def _keep(self, table: Table, result: Examined) -> None:
         entry = CorpusEntry(table, result.known, result.reached)
+        for i in [i for i, one in enumerate(self.seeds) if one is table and result.known.robots]:
+            self._first[i] = entry
         if not result.reached <= self.seen.keys():
             self.corpus.append(entry)
         self.seen.update(result.reached)

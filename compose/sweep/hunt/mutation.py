@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import copy
 import random
+import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from itertools import count
@@ -17,6 +18,7 @@ import msgspec
 
 from compose.errors import UserError
 from compose.launch.planner_loader import PLANNER_NAMES
+from compose.scenario.fault_syntax import EVERYWHERE
 from compose.scenario.kills import DRAWN_VALUE, KILL_POINTS, WORLD
 from compose.scenario.scenario_file import scenario_table, validate
 from compose.sweep import spec
@@ -71,6 +73,26 @@ def seeds(source: str) -> list[Table]:
     return [found[0], *sorted(small, key=lambda one: next(turn[is_noisy(one)]))]
 
 
+def robots_of(table: Mapping[str, Any]) -> list[str]:
+    """Return the ids of the robots of the input."""
+    drawn = table.get("group") or table.get("team") or {"robots": 0}
+    return [one["id"] for one in table.get("robot", [])] or [f"r{i + 1}" for i in range(drawn["robots"])]
+
+
+def of_its_robots(table: Table) -> Table:
+    """Return `table` without the clocks, faults and kills of robots that it does not have."""
+    there, found = {*robots_of(table), WORLD, EVERYWHERE, DRAWN_VALUE}, {**table}
+    for name in [one for one in LISTS if one in table]:
+        found[name] = [row for row in table[name] if there.issuperset(_named(row))]
+    return found
+
+
+def _named(row: Mapping[str, Any]) -> list[str]:
+    """Return the robots that a row of LISTS names."""
+    who = row.get("who", row.get("link", EVERYWHERE))
+    return who if isinstance(who, list) else re.split(r"\s*<?->\s*", who.strip())
+
+
 def is_noisy(table: Mapping[str, Any]) -> bool:
     """Return whether the robots of the input are told that their sensors have noise."""
     return any(table["mission"].get("noise", {}).values())
@@ -92,16 +114,11 @@ def mutated(
             [change] = draw.choices(list(weights), list(weights.values()))
             changed = change(copy.deepcopy(found), known, draw)
         found = changed
-    return found
+    return of_its_robots(found)
 
 
 def joined(table: Table, other: Table, draw: random.Random) -> Table:
-    """Return `table` with some of what `other` has: faults, kills, an attack, a death or noise.
-
-    Both must have robots of the same names.
-    """
-    if [one["id"] for one in table.get("robot", [])] != [one["id"] for one in other.get("robot", [])]:
-        return table
+    """Return `table` with some of what `other` has: faults or kills of its robots, attack, death or noise."""
     found = copy.deepcopy(dict(table))
     for name in draw.sample(INHERITED, 2):
         if name in LISTS and other.get(name):
@@ -112,7 +129,7 @@ def joined(table: Table, other: Table, draw: random.Random) -> Table:
             found["mission"] |= {
                 one: other["mission"][one] for one in (name, "accuracy") if one in other["mission"]
             }
-    return found
+    return of_its_robots(found)
 
 
 def _seed(table: Table, _known: Clues, draw: random.Random) -> Table:
@@ -160,9 +177,18 @@ def _fault(table: Table, known: Clues, draw: random.Random) -> Table | None:
     return table
 
 
-def _kill(table: Table, known: Clues, draw: random.Random) -> Table | None:
-    """Add kills of processes. Sensors that are exact allow many: what a killed process replays is short."""
+def kills_added(table: Table, known: Clues, draw: random.Random) -> Table | None:
+    """Add kills of processes, or kill one at the same point of many ticks.
+
+    Sensors that are exact allow many: what a killed process replays is short.
+    """
     most = MOST_FAULTS if is_noisy(table) else MOST_KILLS
+    if draw.random() < IN_TURN_SHARE:
+        first = max(0, min(known.tick(draw), known.ticks - most))
+        one = {"who": draw.choice([*known.robots, WORLD]), "point": draw.choice(KILL_POINTS)}
+        return {**table, "kill": [{**one, "tick": first + i} for i in range(most)]}
+    if len(table.get("kill", [])) >= most:
+        return None
     for _ in range(min(most - len(table.get("kill", [])), draw.choice((1, 2, 5, most)))):
         who: Any = draw.choice([*known.robots, WORLD])
         kill = {"who": who, "tick": known.tick(draw), "point": draw.choice(KILL_POINTS)}
@@ -173,7 +199,12 @@ def _kill(table: Table, known: Clues, draw: random.Random) -> Table | None:
 
 
 def _clock(table: Table, known: Clues, draw: random.Random) -> Table:
-    """Give a process another clock. A mission takes about 1 s in lockstep, and 60 s in hardware mode."""
+    """Give a process another clock. A mission takes about 1 s in lockstep, and 60 s in hardware mode.
+
+    In half of the cases, faults and kills are left out: only then it also runs in hardware mode.
+    """
+    if draw.random() < 0.5:
+        table = {name: part for name, part in table.items() if name not in ("fault", "kill")}
     last = draw.choice((1.0, 60.0))
     jumps = [[last * draw.random(), draw.choice((-10.0, 0.5, 10.0))] for _ in range(draw.randrange(4))]
     error: Table = {"offset": draw.choice((-1.0, 0.0, 1.0)), "drift": draw.choice((-100.0, 100.0))}
@@ -252,9 +283,9 @@ def _names(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     names = dict(zip(given, draw.sample([*draw.choice(ALIKE), *others], len(given)), strict=True))
     for robot in robots:
         robot |= {name: names[robot[name]] for name in ("id", "peer") if name in robot}
-    for kill in table.get("kill", []):
-        who = kill.get("who", DRAWN_VALUE)
-        kill["who"] = [names.get(one, one) for one in who] if isinstance(who, list) else names.get(who, who)
+    for row in [*table.get("kill", []), *table.get("clock", [])]:
+        who = row.get("who", DRAWN_VALUE)
+        row["who"] = [names.get(one, one) for one in who] if isinstance(who, list) else names.get(who, who)
     table["fault"] = [one for one in table.get("fault", []) if one.get("link", "*") == "*"]
     return table
 
@@ -304,6 +335,8 @@ def _less(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     return None
 
 
+IN_TURN_SHARE = 0.3
+"""The share of kills that are those of one process at one point of consecutive ticks."""
 SHORTENED = 5
 """The number of shorter inputs of which the first that is a mission is taken."""
 
@@ -327,8 +360,8 @@ MUTATIONS: Mapping[Change, float] = {
     _seed: 2.0,
     _start: 2.0,
     _fault: 3.0,
-    _kill: 3.0,
-    _clock: 0.5,
+    kills_added: 3.0,
+    _clock: 1.0,
     _attack: 1.0,
     _link: 0.5,
     _death: 0.7,
