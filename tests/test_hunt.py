@@ -33,7 +33,14 @@ from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep import spec
 from compose.sweep.cells import cells
 from compose.sweep.hunt import coverage, examination
-from compose.sweep.hunt.examination import MOST_TICKS, MOST_WITHOUT_END, examined, scenario_of, watched
+from compose.sweep.hunt.examination import (
+    MOST_TICKS,
+    MOST_WITHOUT_END,
+    Examined,
+    examined,
+    scenario_of,
+    watched,
+)
 from compose.sweep.hunt.exploration import Hunt
 from compose.sweep.hunt.mutation import (
     MOST_KILLS,
@@ -91,6 +98,13 @@ def test_a_hunt_reaches_the_same_with_any_number_of_workers() -> None:
     one, other = hunts
     assert (one.runs, one.seen, one.corpus) == (other.runs, other.seen, other.corpus)
     assert len(one.corpus) > 1
+
+
+def test_a_long_run_that_is_nearer_to_a_bound_does_not_replace_a_short_one() -> None:
+    hunt = Hunt("random-group", 1, 1)
+    for ticks, share in ((2000, 0.9), (100, 0.8), (110, 0.7)):
+        hunt._keep({}, Examined(known=Clues(("r1",), ticks), bound_shares=(share,)))
+    assert sorted([share for share, _ in hunt.slowest.values()]) == [0.8, 0.9]
 
 
 def steps_twice(real: Any) -> Any:

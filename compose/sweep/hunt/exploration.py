@@ -111,8 +111,12 @@ class Hunt:
         """The frequencies of changes of these inputs."""
         self._usual = 1.0
         """The `share` of an input whose run takes the mean time of their changes."""
-        self.slowest: dict[tuple[int, int], tuple[float, CorpusEntry]] = {}
-        """The inputs whose runs used most of a bound, with the share, by the number of bounds and place."""
+        self.slowest: dict[tuple[int, int, int], tuple[float, CorpusEntry]] = {}
+        """The inputs whose runs used most of a bound, with the share, by number of bounds, place and length.
+
+        The length is the number of binary digits of the ticks: a long run replaces no short one, of which ten
+        are changed in its time.
+        """
         self.seen = Counter[str]()
         """The states that the runs have reached, with the number of runs that reached each."""
         self.runs = self.processes = self.refused = 0
@@ -171,7 +175,7 @@ class Hunt:
             self.corpus.append(entry)
         self.seen.update(result.reached)
         for place, share in enumerate(result.bound_shares):
-            which = len(result.bound_shares), place
+            which = len(result.bound_shares), place, result.known.ticks.bit_length()
             if share > self.slowest.get(which, (0.0, None))[0]:
                 self.slowest[which] = share, entry
 
