@@ -2,8 +2,8 @@
 
 Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used S
 seconds of processor time: with the guide, and beside it by chance alone. A table says after how many runs and
-seconds, with those of shrinking the input, each was found, and how small the input is. `--write` replaces the
-table in docs/howto-hunt.md.
+seconds, with those of shrinking the input, each was found, and what the guide found, with how many changes.
+`--write` replaces the table in docs/howto-hunt.md.
 """
 
 from __future__ import annotations
@@ -244,8 +244,8 @@ def main(arguments: list[str]) -> int:
                 hunt = process.submit(hunted, mutant, MUTANTS[mutant], options.cpu, guided=guided)
                 says = hunt.result()
             missed += guided and says.startswith(MISSED)
-            cells.append(says)
-            print(f" | {says}", end="", flush=True)
+            cells.append(says if guided else says.partition(":")[0])
+            print(f" | {cells[-1]}", end="", flush=True)
         print(" |", flush=True)
         rows.append(f"| {' | '.join(cells)} |")
         if options.write:
