@@ -89,7 +89,7 @@ def _entered(context: AbstractContextManager[Any]) -> None:
 def test_what_is_nested_too_deeply_is_refused_before_it_is_parsed(
     text: str, syntax: Syntax, tmp_path: Path
 ) -> None:
-    began = time.monotonic()
+    began = time.process_time()
     with pytest.raises(TooNested):
         check_nesting(text, syntax)
     if syntax == "TOML":
@@ -99,7 +99,7 @@ def test_what_is_nested_too_deeply_is_refused_before_it_is_parsed(
         (tmp_path / "zenoh.json5").write_text(text)
         with pytest.raises(BadConfiguration, match=r"zenoh\.json5: it is nested"):
             configured(tmp_path / "zenoh.json5")
-    assert time.monotonic() - began < 2.0
+    assert time.process_time() - began < 2.0
 
 
 @pytest.mark.parametrize(

@@ -123,10 +123,10 @@ def test_a_torn_frame_that_looks_like_many_takes_no_time(tmp_path: Path) -> None
     inner = b"\xc6" + (MAX_FRAME_BYTES // 2).to_bytes(4, "big")
     path = tmp_path / "a.journal"
     path.write_bytes(head + (inner * (MAX_FRAME_BYTES // 5))[: MAX_FRAME_BYTES - 1])
-    began = time.monotonic()
+    began = time.process_time()
     with pytest.raises(CorruptJournal):
         list(journal_file.read(path))
-    assert time.monotonic() - began < 10.0
+    assert time.process_time() - began < 10.0
 
 
 GARBAGE = {

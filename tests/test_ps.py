@@ -212,25 +212,26 @@ def foreign(mission: Played) -> None:
 
 
 @pytest.mark.parametrize(
-    ("start", "lines"),
+    ("start", "timeout", "lines"),
     [
-        (running, ["tick 7", "tick 7, phase 2, orbiting"]),
-        (over, ["tick 9, over: undecided", "tick 9, phase 3, undecided"]),
-        (alive, ["no tick within 0.5 s", "connected, no message within 0.5 s"]),
+        (running, "60", ["tick 7", "tick 7, phase 2, orbiting"]),
+        (over, "60", ["tick 9, over: undecided", "tick 9, phase 3, undecided"]),
+        (alive, "0.5", ["no tick within 0.5 s", "connected, no message within 0.5 s"]),
         (
             foreign,
+            "2",
             [
-                f"no tick within 0.5 s, protocol version {VERSION + 1} instead of {VERSION}",
-                "connected, no message within 0.5 s",
+                f"no tick within 2 s, protocol version {VERSION + 1} instead of {VERSION}",
+                "connected, no message within 2 s",
             ],
         ),
     ],
 )
 def test_published_values_are_listed_and_others_are_reported_as_unknown(
-    start: Callable[[Played], None], lines: list[str]
+    start: Callable[[Played], None], timeout: str, lines: list[str]
 ) -> None:
     with played(start) as (_, endpoint):
-        assert listed(endpoint, "--timeout", "0.5") == [
+        assert listed(endpoint, "--timeout", timeout) == [
             f"r at {endpoint}, {lines[0]}",
             f"  a  {lines[1]}",
         ]

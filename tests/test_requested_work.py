@@ -173,7 +173,7 @@ def test_ctrl_c_ends_a_page_whose_request_is_being_computed(tmp_path: Path) -> N
         began = time.monotonic()
         page.tell(SIGINT)
         assert page.ended().status == 130
-        assert time.monotonic() - began < 5.0  # a second for connections, and much for a busy machine
+        assert time.monotonic() - began < 0.5 * reruns.TRIAL_S, "the work was not waited for"
         assert page.err == ""
         connection.close()
         until(lambda: not working_for(page.pid), "its process has ended")

@@ -29,6 +29,10 @@ THREADED = "compose.view.export.rerun_recording"
 """a module whose library starts threads, which a process that forks must not have"""
 
 
+WARMED = set[int]()
+"""The ids of the fork servers that have imported all modules."""
+
+
 class Request(msgspec.Struct, frozen=True):
     """A command line, its working directory and its environment."""
 
@@ -48,6 +52,15 @@ def warm_up() -> None:
         import_module(name)
 
 
+def warmed(within: float) -> forked.ForkServer:
+    """Return the fork server after its imports, which must end `within` seconds."""
+    server = forked.fork_server(WARM_UP)
+    if server.pid not in WARMED:
+        assert server.start("os:getpid", "the first").wait(within), f"still importing after {within:g} s"
+        WARMED.add(server.pid)
+    return server
+
+
 def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], within: float) -> int:
     """Run `tandem WORDS` in `folder`, and return its exit status, negative if a signal killed it.
 
@@ -57,7 +70,7 @@ def run(words: list[str], folder: Path | None, out: IO[bytes], err: IO[bytes], w
     with tempfile.NamedTemporaryFile() as file:
         file.write(msgspec.msgpack.encode(command))
         file.flush()
-        server = forked.fork_server(WARM_UP)
+        server = warmed(within)
         streams = [f"/proc/{os.getpid()}/fd/{stream.fileno()}" for stream in (out, err)]
         process = server.start(MAIN, "tandem", file.name, *streams)
         if not process.wait(within):
