@@ -73,7 +73,7 @@ def pytest_xdist_auto_num_workers(config: pytest.Config) -> int:  # noqa: ARG001
     return 2 * (os.cpu_count() or 1)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def keys(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return a folder with the keys of a mission of a and b, which tests must not change."""
     folder = tmp_path_factory.mktemp("keys") / "keys"
@@ -110,19 +110,19 @@ def endless(tmp_path: Path) -> Path:
     return path
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the recording of paper-1, which tests must not change."""
     return recorded("paper-1", tmp_path_factory.mktemp("recorded"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def noisy(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the recording of noisy, which tests must not change."""
     return recorded("noisy", tmp_path_factory.mktemp("recorded"))
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture(scope="session")
 def sample() -> RangeRecording:
     """Return the two robots of the recorded sample."""
     return read_ranges(SAMPLE)

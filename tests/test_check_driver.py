@@ -81,15 +81,18 @@ def test_a_range_to_a_robot_that_is_not_in_the_group_ends_the_exercise() -> None
     ("broken", "said"),
     [
         (
-            "RangesInFeet",
+            "virtual_time:RangesInFeet",
             "wrong  ranges to the anchor are in metres, and agree with the path from the odometry: ",
         ),
-        ("SensesNonsense", "the exercise can be completed: after 'arc': sense(5): Expected"),
-        ("LosesItsSensors", "the exercise can be completed: after 'straight': OSError: no such device"),
+        ("broken_drivers:SensesNonsense", "the exercise can be completed: after 'arc': sense(5): Expected"),
+        (
+            "broken_drivers:LosesItsSensors",
+            "the exercise can be completed: after 'straight': OSError: no such device",
+        ),
     ],
 )
 def test_what_is_wrong_is_a_line_and_a_status(broken: str, said: str) -> None:
-    ended = tandem("check-driver", f"tests.broken_drivers:{broken}", "--rate", "10")
+    ended = tandem("check-driver", f"tests.{broken}", "--rate", "10")
     assert ended.status == 1
     assert said in ended.out
     assert ended.err == ""

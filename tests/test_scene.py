@@ -32,13 +32,6 @@ from world.channel import LinkState
 from world.world_journal import world_history
 
 
-@pytest.fixture(scope="module")
-def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("paper-1")
-    in_process.run_mission(load("paper-1"), folder)
-    return folder
-
-
 class Performance(NamedTuple):
     """A recorded run with all its scenes, and what a viewer notes about its journals."""
 

@@ -98,7 +98,7 @@ def test_a_robot_whose_peer_has_claimed_first_localises_too(seed: int) -> None:
     assert tandem.run(scenario).outcome == "localised"
 
 
-@pytest.mark.parametrize("seed", series([455, 694, 1102, 1198]))
+@pytest.mark.parametrize("seed", series([694, 455, 1102, 1198]))
 def test_a_mission_that_once_stalled_localises(seed: int) -> None:
     """In 455 and 1102 both stood still in phase 3, in 694 and 1198 b measured at two places in phase 1."""
     assert stride(scenario_of(SIGMA, seed, reach=1.5).mission) == 1
