@@ -152,6 +152,8 @@ def test_what_is_no_recording_is_refused_with_the_formats(tmp_path: Path) -> Non
     assert refused(tmp_path) == f"{tmp_path}/odometry.csv: it is not UTF-8 text"
     (tmp_path / "odometry.csv").write_text("robot,t0,t1,dx,dy,dheading\na,0,1,1,0,0\n")
     assert refused(tmp_path) == f"{tmp_path}/ranges.csv cannot be read: No such file or directory"
+    (tmp_path / "Ranges.csv").write_text("t,from,to,range\n")
+    assert refused(tmp_path) == f"{tmp_path}/Ranges.csv: the name of a table is in lower case: ranges.csv"
 
 
 def test_a_damaged_mcap_file_is_refused(tmp_path: Path) -> None:

@@ -210,6 +210,12 @@ TILTED = odometry(1.0, 0.0, 0.0, 0.0)
 TILTED.pose.pose.orientation.x = 1.0
 
 
+def test_the_metadata_of_something_else_are_refused(tmp_path: Path) -> None:
+    (tmp_path / "metadata.yaml").write_text("name: it\n")
+    with pytest.raises(UserError, match=r"its metadata\.yaml is not that of a rosbag2"):
+        read_ranges(tmp_path)
+
+
 @pytest.mark.parametrize(
     ("mapping", "messages", "says"),
     [

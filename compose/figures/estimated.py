@@ -226,7 +226,7 @@ def _residuals(axes: Axes, drawn: Drawn, which: int) -> None:
     if fitted is None:
         return
     fit, used = fitted
-    rows = used.ranges.pairs[which]
+    _, rows = used.ranges.pairs[which]
     times = drawn.since_begin(drawn.problem.time_of(fit.ticks[rows]))
     residuals, good = fit.residuals[rows], fit.weights[rows] > OUTLIER
     axes.axhline(0.0, color=PALE, lw=0.6)

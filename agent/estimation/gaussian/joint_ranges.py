@@ -78,17 +78,18 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         return sorted(set(self.radio.tolist()) - {-1})
 
     @cached_property
-    def pairs(self) -> list[NDArray[np.bool]]:
-        """The ranges of each pair of radios that has some; shapes (N,)."""
-        return [self.radio == one for one in self.radios]
+    def pairs(self) -> list[tuple[tuple[int, int], Places]]:
+        """The two ends, like `first` and `second`, and the rows of each pair of radios that has ranges."""
+        rows_of = [np.flatnonzero(self.radio == one) for one in self.radios]
+        return [((int(self.first[rows[0]]), int(self.second[rows[0]])), rows) for rows in rows_of]
 
     @cached_property
     def of_anchors(self) -> dict[int, list[Places]]:
         """The rows of the ranges to each of its anchors, of each robot that has some."""
         found = dict[int, list[Places]]()
-        for rows in map(np.flatnonzero, self.pairs):
-            if self.second[rows[0]] < 0:
-                found.setdefault(int(self.first[rows[0]]), []).append(rows)
+        for (robot, other), rows in self.pairs:
+            if other < 0:
+                found.setdefault(robot, []).append(rows)
         return found
 
     def common_errors(self, priors: Priors) -> Array:
@@ -323,26 +324,24 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
             most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
         if len(ranges.rho) <= min(most, MOST_MUTUAL_RANGES // max(pairs, 1)):
             return self
-        rows_of = list(map(np.flatnonzero, ranges.pairs))
-        mutual = [(k := int(ranges.second[rows[0]])) >= 0 and not self.is_anchor(k) for rows in rows_of]
+        mutual = [other >= 0 and not self.is_anchor(other) for (_, other), _ in ranges.pairs]
         of_pair = min(most, max(MOST_MUTUAL_RANGES // max(sum(mutual), 1), WEIGHED_OF_PAIR))
         left = np.zeros(len(ranges.rho), bool)
-        for rows, both_drive in zip(rows_of, mutual, strict=True):
+        for (ends, rows), both_drive in zip(ranges.pairs, mutual, strict=True):
             before = int(np.count_nonzero(ranges.tick[rows] <= tick))
             bound = of_pair if both_drive else most
             left[rows[:before]] = True
-            left[self._weighed(rows[before:], bound)] = True
+            left[self._weighed(ends, rows[before:], bound)] = True
         return self if left.all() else msgspec.structs.replace(self, ranges=ranges.rows(left))
 
-    def _weighed(self, rows: Places, most: int) -> Places:
-        """Return at most `most` of the `rows` of one pair of radios.
+    def _weighed(self, ends: tuple[int, int], rows: Places, most: int) -> Places:
+        """Return at most `most` of the `rows` of the pair of radios at both `ends`.
 
         Places are left out only where one range of each is still too many. A place is a stretch of
         MOVED * reach of the way, to which in each step the end adds that moves more.
         """
         if len(rows) <= most:
             return rows
-        ends = int(self.ranges.first[rows[0]]), int(self.ranges.second[rows[0]])
         way = self._positions(ends, self.ranges.tick[rows])
         parts = np.cumsum(_longest(np.diff(way))) // (MOVED * self.reach)
         begins = np.append(0, 1 + np.flatnonzero(np.diff(parts, prepend=0.0)))
@@ -395,11 +394,8 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     @cached_property
     def places_of_pairs(self) -> list[tuple[tuple[int, int], int]]:
         """The two ends of each pair of radios, and the number of its ranges that are `from_places`."""
-        ranges, found = self.ranges, []
-        for rows in map(np.flatnonzero, ranges.pairs):
-            ends = int(ranges.first[rows[0]]), int(ranges.second[rows[0]])
-            found.append((ends, len(self.from_places(ends, ranges.tick[rows]))))
-        return found
+        tick = self.ranges.tick
+        return [(ends, len(self.from_places(ends, tick[rows]))) for ends, rows in self.ranges.pairs]
 
     def alone(self, robot: int) -> JointMeasurements:
         """Return the measurements of one robot near its anchor, which is the origin.

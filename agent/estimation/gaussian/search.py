@@ -169,15 +169,11 @@ def beacons(robot: int, located: Sequence[int], measured: JointMeasurements) -> 
 
 
 def _paired(located: Sequence[int], measured: JointMeasurements, fewest: int) -> Iterator[Candidate]:
-    ranges = measured.ranges
-    for own in ranges.pairs:
-        row = int(np.argmax(own))
-        a, b = int(ranges.first[row]), int(ranges.second[row])
-        if b < 0 or a in located or b in located:
+    for (a, b), rows in measured.ranges.pairs:
+        if b < 0 or a in located or b in located or len(rows) < fewest:
             continue
-        count = int(np.count_nonzero(own))
-        if count >= fewest and _anchors_of_pair(a, b, measured, fewest) is not None:
-            yield Candidate(count, (a, b))
+        if _anchors_of_pair(a, b, measured, fewest) is not None:
+            yield Candidate(len(rows), (a, b))
 
 
 def _anchors_of_pair(

@@ -70,7 +70,7 @@ def calibrated_by_fit(measured: Measurements, done: Callable[[], None] = lambda:
         radios[ranges.radio[rows][0]]: PairErrors(
             measured.time_of(ranges.tick[rows]), ranges.rho[rows], fitted.fit.residuals[rows]
         )
-        for rows in ranges.pairs
+        for _, rows in ranges.pairs
     }
     most = max([len(one.t) for one in errors.values()], default=0)
     if most < FEWEST_ERRORS:

@@ -149,7 +149,7 @@ def longest_possible(known: JointMeasurements) -> float:
     rho = known.ranges.rho
     medians = [
         float(np.partition(own, (len(own) - 1) // 2)[(len(own) - 1) // 2])
-        for own in map(rho.__getitem__, known.ranges.pairs)
+        for own in [rho[rows] for _, rows in known.ranges.pairs]
     ]
     ways = sorted([float(np.sum(np.abs(path.v))) * known.period for path in known.paths])
     most = POSSIBLE * (max(medians, default=0.0) + sum(ways[-2:]))

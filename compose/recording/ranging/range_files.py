@@ -78,6 +78,7 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
         anchors = _anchors(anchors_csv) if anchors_csv is not None else []
         is_bag = path.suffix in (".toml", ".db3", ".bag") or (path / BAG_METADATA).exists()
         tables = any((path / f"{name}.csv").exists() for name in (*ODOMETRY, "ranges"))
+        _check_names(path)
         if path.is_dir() and not (tables or is_bag):
             if not journals_in(path):
                 others = sorted(one.name for one in path.glob("*.csv"))
@@ -109,6 +110,14 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
     except OSError as error:
         raise BadRecording(f"{error.filename or path} cannot be read: {error.strerror or error}") from None
     return builder.recording()
+
+
+def _check_names(folder: Path) -> None:
+    """Raise BadRecording if the name of a table in `folder` has capital letters."""
+    for one in sorted(folder.iterdir()) if folder.is_dir() else ():
+        name = one.name.lower()
+        if name in [f"{table}.csv" for table in TABLES] and not (folder / name).exists():
+            raise BadRecording(f"{one}: the name of a table is in lower case: {name}")
 
 
 def _anchors(path: Path) -> list[AnchorRow]:

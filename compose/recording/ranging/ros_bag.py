@@ -157,6 +157,8 @@ def _messages(path: Path, table: BagFile, unused: Counter[str]) -> Iterator[_Mes
     except (UserError, OSError):
         raise
     except Exception as error:  # noqa: BLE001  # the library raises all kinds of errors for invalid files
+        if error.__context__ is not None and isinstance(error.__context__.__context__, KeyError):
+            raise BadRecording(f"{bag}: its metadata.yaml is not that of a rosbag2") from None
         raise BadRecording(f"{place}: {' '.join(str(error or type(error).__name__).split())}") from None
 
 
