@@ -10,12 +10,11 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from compose.cli.arguments import MOST_WORKERS
 from compose.errors import UserError
 from compose.extras import need
 from compose.launch.class_loader import need_module
 from compose.recording.recording_files import folder_for
-from compose.sweep import spec
+from compose.sweep import MOST_WORKERS, spec
 from compose.sweep.cells import Cell, label, trial_table
 from compose.sweep.spec import Sweep
 from protocol.network.inbox import Inbox

@@ -54,10 +54,6 @@ def up_to(most: int) -> Callable[[str], int]:
     return checked(f"a whole number from 1 to {most}", _whole, lambda value: 0 < value <= most)
 
 
-MOST_WORKERS = 1000
-"""The largest number of worker processes."""
-
-
 def _cell_and_trial(text: str) -> tuple[int, int]:
     cell, trial = _parts("(?:([0-9]{1,18}):)?([0-9]{1,18})", text)
     return int(cell or 0), int(trial)

@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from compose.cli import arguments
 from compose.cli.removed import another_scenario
 from compose.figures import FIGURE_FORMATS, PICTURES
+from compose.sweep import MOST_WORKERS
 
 SHELLS = ("bash", "zsh")
 """The shells for which there is completion."""
@@ -33,7 +34,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--days": arguments.up_to(36_500),
     "--format": FIGURE_FORMATS,
     "--clock": arguments.clock,
-    "--jobs": arguments.up_to(arguments.MOST_WORKERS),
+    "--jobs": arguments.up_to(MOST_WORKERS),
     "--kill": arguments.kill,
     "--model": arguments.model,
     "--only": PICTURES,
@@ -49,7 +50,7 @@ VALUES: Mapping[str, Callable[[str], Any] | tuple[str, ...]] = {
     "--seed": arguments.natural,
     "--trials": arguments.up_to(10**7),
     "--window": arguments.window,
-    "--workers": arguments.up_to(arguments.MOST_WORKERS),
+    "--workers": arguments.up_to(MOST_WORKERS),
 }
 """The functions that turn the texts of arguments into values, or their choices; all others are texts."""
 
