@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import os
 import re
 import shutil
 from collections.abc import Sequence
 from pathlib import Path
-from signal import SIGCONT, SIGSTOP
 from typing import Any
 
 import msgpack
@@ -36,10 +34,6 @@ from protocol.messages import (
 )
 from protocol.wire import MAX_FRAME_BYTES, EncodedMessages, decode, encode
 from tests.commands import (
-    OVER,
-    REAL_TIME,
-    TandemProcess,
-    process_of,
     refused,
     several_pairs,
     tandem,
@@ -61,7 +55,6 @@ from tests.planted import (
 )
 from tests.series import series
 from tests.test_planted_violations import noise
-from tests.test_real_time import missed
 from world import world_journal as reader_of_world
 from world.scenario import Scenario
 from world.simulation import Simulation
@@ -137,22 +130,6 @@ def test_a_run_as_processes_violates_no_rule_and_the_command_reports_it(tmp_path
     assert [line.split()[0] for line in lines[3:]] == [rule.__name__ for rule in AUDIT_RULES]
     assert [line.split()[2] for line in lines[3:]] == ["0"] * len(AUDIT_RULES)
     assert lines[6].split() == ["observation", str(2 * (last + 1)), "0"]
-
-
-@pytest.mark.long
-def test_a_run_in_real_time_with_missed_commands_violates_no_rule(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    (tmp_path / "assured.toml").write_text(REAL_TIME)
-    with TandemProcess("run", tmp_path / "assured.toml", "--rate", "20", "--out", out, "-q") as run:
-        run.until_written(out / WORLD_JOURNAL, 3000)
-        stopped = process_of(out, "agent", "a")
-        os.kill(stopped, SIGSTOP)
-        run.until(lambda: missed(out / WORLD_JOURNAL, "a") >= 3, "three of a's Commands are missed")
-        os.kill(stopped, SIGCONT)
-        assert run.ended().status in OVER
-    findings = audit(out)
-    assert [one for one in findings.violations if not one.breaks_off] == []
-    assert all(made for rule, made in checks(findings).items() if rule not in ("claim", "distance", "bound"))
 
 
 def test_a_failed_run_violates_no_rule() -> None:
