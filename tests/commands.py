@@ -66,10 +66,10 @@ id = "a"
 anchor = [0.0, 0.0]
 [[robot]]
 id = "b"
-anchor = [120.0, 0.0]
+anchor = [60.0, 0.0]
 """
 """A scenario of LONG_TICKS ticks: long enough for a test to interfere with the run."""
-LONG_TICKS = 4794
+LONG_TICKS = 1874
 ASSURED = "max_ticks = 1_000_000\n" + PAPER_1.replace('"paper"', '"assured"').replace(
     "10.0, 0.0", "60.0, 0.0"
 ).replace("11.3", "61.3")
@@ -78,13 +78,13 @@ REAL_TIME = ASSURED.replace("1_000_000", "600")
 """ASSURED for `--rate 20`, with fewer ticks. It ends after half a minute, with any outcome."""
 OVER = (0, 1)
 """The exit statuses of a mission that has ended; in real time, either is possible."""
+LONGER = LONG.replace("60.0", "120.0")
+"""A scenario of 4794 ticks: long enough for other commands to start and end meanwhile."""
 ENDLESS = (
-    LONG.replace("120.0", "400.0")
-    .replace("max_speed = 1.0", "max_speed = 0.1")
-    .replace('"long"', '"endless"')
+    LONG.replace("60.0", "400.0").replace("max_speed = 1.0", "max_speed = 0.1").replace('"long"', '"endless"')
 )
 """A scenario so long that it does not end during a test."""
-LONG_JOURNAL_BYTES = 470_000
+LONG_JOURNAL_BYTES = 185_000
 """The size in bytes that the world's journal of LONG exceeds during the run."""
 
 
@@ -269,9 +269,10 @@ def refused(ended: Ended, *words: str) -> None:
 
 @contextmanager
 def world(scenario: str | Path, *arguments: str | Path) -> Iterator[tuple[TandemProcess, str]]:
-    """Yield a simulator process that waits for its robots, and its endpoint."""
+    """Yield a simulator process that waits for its robots, longer than any test, and its endpoint."""
     endpoint = free_endpoint()
-    with TandemProcess("world", scenario, "--listen", endpoint, *arguments) as command:
+    patient = ("--timeout", "600", *arguments)
+    with TandemProcess("world", scenario, "--listen", endpoint, *patient) as command:
         command.until_prints("waiting for")
         yield command, endpoint
 

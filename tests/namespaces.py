@@ -28,7 +28,7 @@ from protocol.messages import Command, DeadlineMissed, Environment, FinalReport,
 from protocol.network import session
 from protocol.network.endpoints import Endpoints, configured
 from protocol.wire import MAX_FRAME_BYTES, decode
-from tests.commands import LONG, PAPER_1, Ended, TandemProcess, journals, size, tandem, until
+from tests.commands import LONGER, PAPER_1, Ended, TandemProcess, journals, size, tandem, until
 from world.scenario import Scenario
 
 HOSTS = {"world": "10.77.0.1", "a": "10.77.0.2", "b": "10.77.0.3", "router": "10.77.0.4"}
@@ -102,7 +102,7 @@ class Run:
         self._network = network
         self._stack = stack
         self.scenario = folder / "scenario.toml"
-        self.scenario.write_text(ASSURED if case.real_time else LONG)
+        self.scenario.write_text(ASSURED if case.real_time else LONGER)
         self._keys = folder / "keys" if case.secured else None
         if self._keys is not None:
             made = tandem("keys", self._keys, "--robots", "a,b", "--host", HOSTS["router"])
@@ -231,7 +231,7 @@ def local() -> dict[str, bytes]:
     """Return the recording of the lockstep mission, run in one process."""
     with tempfile.TemporaryDirectory(prefix="tandem-hosts-") as folder:
         scenario, out = Path(folder) / "scenario.toml", Path(folder) / "out"
-        scenario.write_text(LONG)
+        scenario.write_text(LONGER)
         assert tandem("run", scenario, "--in-process", "-q", "--out", out).status == 0
         return journals(out) | {"ticks.csv": (out / "ticks.csv").read_bytes()}
 

@@ -25,6 +25,7 @@ from compose.launch.supervisor import Supervisor
 from protocol.network.diagnosis import MUTE
 from protocol.network.inbox import Arrival, Inbox, Interrupted
 from tests.commands import (
+    BOUND_S,
     LONG,
     LONG_JOURNAL_BYTES,
     LONG_TICKS,
@@ -38,10 +39,8 @@ from tests.commands import (
 )
 from tests.series import series
 
-AT_ONCE_S = 15.0
-"""Half the timeout of 30 s, in s. A process that ends within it did not wait for the timeout."""
-SOON_S = 25.0
-"""The time in s in which a process with `--timeout` TIMEOUT ends. It is less than the default of 30 s."""
+PATIENT = ("--timeout", "600")
+"""A timeout in s that no test waits for: a process that has ended did so for another reason."""
 TIMEOUT = "5"
 """The timeout in s. It is longer than a busy machine takes to connect a process."""
 
@@ -95,10 +94,10 @@ def test_an_interrupted_run_reports_it_and_leaves_no_process(
     moment: str, endless: Path, tmp_path: Path
 ) -> None:
     out, number = tmp_path / "out", SIGNALS[moment]
-    with TandemProcess("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q", *PATIENT) as run:
         run.until(lambda: MOMENTS[moment](run, out), moment)
         run.tell(number)
-        ended = run.ended(AT_ONCE_S)
+        ended = run.ended()
     assert ended == (130, "", f"tandem run: stopped by {number.name}\n")
     assert not processes_of(out)
 
@@ -119,7 +118,7 @@ def test_a_signal_that_does_not_interrupt_a_wait_ends_it_all_the_same() -> None:
     try:
         other.start()
         with pytest.raises(Interrupted, match="SIGUSR1"):
-            inbox.next(AT_ONCE_S)
+            inbox.next(BOUND_S)
     finally:
         other.join()
         signal.signal(signal.SIGUSR1, before)
@@ -130,10 +129,10 @@ def test_a_run_interrupted_as_it_ends_reports_the_outcome_or_the_interruption(
     moment: str, long: Path, tmp_path: Path
 ) -> None:
     out, number = tmp_path / "out", SIGNALS[moment]
-    with TandemProcess("run", long, "--out", out, "-q") as run:
+    with TandemProcess("run", long, "--out", out, "-q", *PATIENT) as run:
         until(lambda: LAST_MOMENTS[moment](run, out) or not run.running, moment)
         run.tell(number)
-        ended = run.ended(AT_ONCE_S)
+        ended = run.ended()
     assert not processes_of(out)
     if ended.status == 130:
         assert ended[1:] == ("", f"tandem run: stopped by {number.name}\n")
@@ -147,11 +146,11 @@ def test_a_run_interrupted_while_it_starts_leaves_no_process(
     delay: float, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with TandemProcess("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q", *PATIENT) as run:
         began = time.monotonic()
         run.until(lambda: time.monotonic() >= began + delay, f"{delay} s have passed")
         run.tell(SIGTERM)
-        ended = run.ended(AT_ONCE_S)
+        ended = run.ended()
     assert not processes_of(out)
     if ended.status != -SIGTERM:  # Python was not yet started
         assert ended.status == 130
@@ -160,10 +159,10 @@ def test_a_run_interrupted_while_it_starts_leaves_no_process(
 
 def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with TandemProcess("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q", *PATIENT) as run:
         run.until_written(out / "world.journal", 10_000)
         until(lambda: not run.tell(SIGINT), "it ends, told again and again")
-        ended = run.ended(AT_ONCE_S)
+        ended = run.ended()
     assert not processes_of(out)
     assert ended.status == 130
     assert "Traceback" not in ended.err
@@ -172,19 +171,19 @@ def test_a_second_ctrl_c_changes_nothing(endless: Path, tmp_path: Path) -> None:
 @pytest.mark.parametrize("number", series([SIGINT, SIGTERM]), ids=["SIGINT", "SIGTERM"])
 def test_an_interrupted_world_and_agent_report_it(number: signal.Signals) -> None:
     with world("paper-1") as (clock, endpoint):
-        with TandemProcess("agent", "a", "--connect", endpoint) as agent:
+        with TandemProcess("agent", "a", "--connect", endpoint, *PATIENT) as agent:
             agent.until_prints("a: in run")
             agent.tell(number)
-            assert agent.ended(AT_ONCE_S)[::2] == (130, f"tandem agent a: stopped by {number.name}\n")
+            assert agent.ended()[::2] == (130, f"tandem agent a: stopped by {number.name}\n")
         clock.tell(number)
-        assert clock.ended(AT_ONCE_S)[::2] == (130, f"tandem world: stopped by {number.name}\n")
+        assert clock.ended()[::2] == (130, f"tandem world: stopped by {number.name}\n")
 
 
 def test_an_agent_that_searches_for_a_world_can_be_interrupted() -> None:
     with TandemProcess("agent", "a", "--connect", free_endpoint()) as agent:
         agent.until(lambda: agent.catches(SIGHUP), "it is ready")
         agent.tell(SIGINT)
-        ended = agent.ended(AT_ONCE_S)
+        ended = agent.ended()
     assert ended.status == 130
     assert re.fullmatch(r"tandem agent( a)?: stopped by SIGINT\n", ended.err)
 
@@ -197,10 +196,10 @@ def test_a_process_that_dies_ends_the_run_at_once_and_is_named(
     child: str, endless: Path, tmp_path: Path
 ) -> None:
     out = tmp_path / "out"
-    with TandemProcess("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q", *PATIENT) as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(process_of(out, *child.split()), SIGKILL)
-        ended = run.ended(AT_ONCE_S)
+        ended = run.ended()
     assert ended == (3, "", f"tandem run: failed: {child} was killed by signal 9\n")
     assert not processes_of(out)
     summary = json.loads((out / "summary.json").read_text())
@@ -215,7 +214,7 @@ def test_a_robot_that_stops_sending_fails_the_run_within_the_timeout(endless: Pa
     with TandemProcess("run", endless, "--out", out, "--timeout", TIMEOUT, "-q") as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(process_of(out, "agent", "b"), SIGSTOP)
-        ended = run.ended(SOON_S)
+        ended = run.ended()
     assert ended.status != 0
     assert re.search(r"no answer from b( \(not connected\))? at tick ", ended.out + ended.err)
     assert f"for {TIMEOUT} s" in ended.out + ended.err
@@ -229,7 +228,7 @@ def test_an_agent_whose_world_dies_ends_within_its_timeout(tmp_path: Path) -> No
         with TandemProcess("agent", "a", "--connect", endpoint, *timeout) as agent:
             agent.until_answered("a", tmp_path)
             clock.tell(SIGKILL)
-            ended = agent.ended(SOON_S)
+            ended = agent.ended()
     assert ended.status == 3
     assert ended.err.splitlines() == [
         f"tandem agent a: the world has gone; waiting {TIMEOUT} s for it",
@@ -249,9 +248,9 @@ def test_a_world_whose_robot_never_connects_fails_and_names_it(comes: str, tmp_p
             agent.until(lambda: agent.catches(SIGHUP), "it looks for its world")
         arguments = ("--listen", endpoint, "--timeout", TIMEOUT, "--out", tmp_path)
         clock = stack.enter_context(TandemProcess("world", "paper-1", *arguments))
-        ended = clock.ended(SOON_S)
+        ended = clock.ended()
         if comes == "a":
-            parted = agent.ended(SOON_S)
+            parted = agent.ended()
             assert parted.status == 3
             assert f"a: failed after 0 ticks ({reason})" in parted.out
     assert ended.status == 3
@@ -282,7 +281,7 @@ def test_an_agent_at_a_port_that_does_not_speak_zenoh_gives_up() -> None:
 
 def test_processes_end_when_their_launcher_is_killed(endless: Path, tmp_path: Path) -> None:
     out = tmp_path / "out"
-    with TandemProcess("run", endless, "--out", out, "-q") as run:
+    with TandemProcess("run", endless, "--out", out, "-q", *PATIENT) as run:
         run.until_written(out / "world.journal", 10_000)
         os.kill(run.pid, SIGKILL)
         until(lambda: not processes_of(out), "all have ended")

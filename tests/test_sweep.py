@@ -270,7 +270,7 @@ def test_a_sweep_goes_on_after_its_machine_has_slept(folder: Path, monkeypatch: 
     with TandemProcess("sweep", "lengthy.toml", "--out", "out", "--workers", "1", cwd=folder) as command:
         command.until(lambda: parts(folder / "out"), "a chunk is done")
         command.tell(SIGSTOP)
-        time.sleep(12.0)  # longer than ten heartbeats of a worker
+        time.sleep(6.0)  # longer than ten heartbeats of a worker, which are 0.5 s apart
         command.tell(SIGCONT)
         assert command.ended().status == 1  # some of the missions are undecided
     assert len(rows(folder / "out")) == 80
