@@ -5,14 +5,21 @@ from __future__ import annotations
 import random
 from collections.abc import Mapping
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
 
 import pytest
 
+from agent.process.node import AgentProcess
+from agent.process.recovery import Memory
+from agent.process.robot import Robot
 from compose.errors import BadScenario
+from compose.launch.planner_loader import planner_of
 from compose.launch.virtual_hardware import HardwareEnd, _Body, run_hardware
 from compose.scenario.scenario_file import load, parse
 from protocol.messages import MissionEnd
 from protocol.network.clock import Clock, ClockError
+from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from tests import test_field
 from tests.commands import OVER, PAPER_1, tandem
 from tests.series import series
@@ -58,6 +65,42 @@ def test_a_clock_shows_its_error_and_never_goes_back() -> None:
         true["now"] = now
         shown.append(clock() - 500.0)
     assert shown == pytest.approx([1.0, 10.0009, 16.001, 25.0019, 25.0019, 26.002])
+
+
+MANY = 10
+"""More waits than any rounding of times needs."""
+
+
+class Silence(Inbox):
+    """An inbox in which nothing arrives, with a clock that shows the time until which was waited last."""
+
+    def __init__(self) -> None:
+        self.now, self.waits = 0.0, 0
+        super().__init__("a", Clock(true=lambda: self.now))
+
+    def next(self, timeout: float | None) -> Arrival:
+        assert timeout is not None
+        self.now, self.waits = self.now + max(timeout, 0.0), self.waits + 1
+        assert self.waits < MANY, "it waits for a time that has come"
+        return NO_ARRIVAL
+
+
+@pytest.mark.parametrize(
+    ("now", "suspended"),
+    [(9.838689737846808, 10.115657822298358), (10.142627495997335, 21.40739787269734)],
+)
+def test_an_agent_gives_up_on_the_answer_to_its_last_message_when_its_wait_is_over(
+    now: float, suspended: float
+) -> None:
+    """A clock in memory, which only waits advance, would otherwise stand still for ever."""
+    config, inbox = load("paper-1").config("a", None), Silence()
+    process = AgentProcess(Memory(config, Robot(config, planner_of(config))), "silent", inbox)
+    link = SimpleNamespace(command=len, next=lambda until: inbox.next(until - inbox.clock()))
+    process._link = cast(Any, link)
+    inbox.now, inbox._asleep = now, suspended  # the sum of both is rounded
+    process._conclude(MissionEnd(0, "failed"))
+    process._answer_end(MissionEnd(0, "failed"))
+    assert 0 < inbox.waits < MANY
 
 
 # --- hardware mode in virtual time --------------------------------------------------------------------

@@ -318,7 +318,7 @@ class AgentProcess:
         self._link.command(frame)
         self._out_of_step.over()
         gone = False
-        while self._inbox.awake() < self._give_up:
+        while self._inbox.clock() < self._gives_up_at():
             arrival = self._next(self._inbox.clock() + LAST_WORD_S if gone else None)
             if arrival.topic == "observation":
                 if arrival.frame == frame:
