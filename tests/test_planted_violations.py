@@ -410,7 +410,7 @@ def test_a_manoeuvre_beyond_the_limits_is_found(folder: Path) -> None:
     (before,) = [one for one in messages(folder / B) if of(Observation, LAST)(one)]
     plant(folder / B, (of(Observation, LAST), to(executed=replace(before.executed, v=1.0 + 1e-9))))
     findings = audit(folder)
-    assert what(findings, "limits") == ["it drove v = 1, expected at most 1"]
+    assert what(findings, "limits") == ["it drove v = 1.000000001, expected at most 1"]
     assert {(tick, robot) for tick, robot, _ in found(findings)} == {(LAST, "b")}
     assert {rule for _, _, rule in found(findings)} == {"observation", "decision", "limits", "log"}
 

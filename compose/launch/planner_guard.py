@@ -30,7 +30,7 @@ def beyond_limits(v: float, omega: float, mission: Mission) -> str | None:
     """Return which of two speeds (m/s, rad/s) is beyond its limit, for a user; None if both keep it."""
     for name, value, limit in (("v", v, mission.max_speed), ("omega", omega, mission.max_turn_rate)):
         if abs(value) > limit * (1.0 + LIMIT_ROUNDING):
-            return f"{name} = {value:g}, expected at most {limit:g}"
+            return f"{name} = {value:.14g}, expected at most {limit:g}"  # digits that show the excess
     return None
 
 
