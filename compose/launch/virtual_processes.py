@@ -388,7 +388,9 @@ class _VirtualInbox(Inbox):
 
     def next(self, timeout: float | None) -> Arrival:
         """Return the next event, or NO_ARRIVAL after `timeout` s."""
-        until = self.clock() + timeout if timeout is not None else math.inf
+        until = math.inf
+        if timeout is not None:
+            until = self.clock() + (max(timeout, LEAST_WAIT_S) if timeout > 0.0 else timeout)
         while (arrival := super().next(0.0)) is NO_ARRIVAL and (left := until - self.clock()) > 0.0:
             began = self.clock()
             self._process.wait(self._network.now + max(min(left, SIGNAL_S), LEAST_WAIT_S))
