@@ -208,10 +208,11 @@ class Field:
     def _gather(self, give_up: float) -> None:
         """Wait until tick 0 can begin: for the first robot when all agents are connected, then for the rest.
 
-        A resumed process only waits for its own agent, because the mission of others may have ended. One
-        that was killed before tick 0 may have missed the TickStart of a robot that now waits for it. It
-        therefore begins after UNHEARD ticks without one. A robot of a group begins at `give_up` without those
-        that are missing, if any other is there. Meanwhile its agent is told every WAITING_S that it waits.
+        A resumed process only waits for its own agent, because the mission of others may have ended. The
+        TickStart of a robot that now waits for this one may have been lost: just after two routers have
+        connected, Zenoh loses messages, and a process that was killed before tick 0 may have received it. A
+        robot therefore begins UNHEARD ticks after all are connected. One of a group begins at `give_up`
+        without those that are missing, if any other is there. Its agent is told every WAITING_S.
 
         Raises NoStart.
         """
@@ -220,8 +221,10 @@ class Field:
         unheard = self._inbox.clock() + UNHEARD * self._tick_s
         while not self._may_begin():
             missing = [one for one in (self._id, *self._others) if one not in self._alive]
-            if self._restarted and not missing and self._inbox.clock() >= unheard:
-                self._next = self._inbox.clock()
+            if missing and not self._restarted:
+                unheard = self._inbox.clock() + UNHEARD * self._tick_s
+            elif not missing and self._inbox.clock() >= unheard:
+                self._next, self._astray = self._inbox.clock(), self._max_ticks + 1
                 break
             if self._inbox.clock() >= give_up:
                 if self._source.joins and self._id not in missing and self._alive > {self._id}:
@@ -233,7 +236,7 @@ class Field:
             if (now := self._inbox.clock()) >= tell:
                 self._observation.put(encode(TickStart(self._tick + 1, self._id)))
                 tell = now + waiting_s
-            until = min(give_up, tell, unheard) if self._restarted and unheard > now else min(give_up, tell)
+            until = min(give_up, tell, unheard) if unheard > now else min(give_up, tell)
             self._take(self._inbox.next(until - self._inbox.clock()))
         if self._next == UNKNOWN and not self._restarted:  # it follows nobody yet
             self._astray = ASTRAY
