@@ -20,8 +20,6 @@ from protocol.wire import MAX_REPORT_BYTES, MalformedFrame, decode, encode
 
 ANSWERS = {"command": Command, "estimate": Estimate, "summary": Summary, "rendezvous": Rendezvous}
 """The types of the answers, by method."""
-
-
 LIMIT_ROUNDING = 1e-12
 """The part of a limit by which rounding may move a quotient of a length and a period beyond it."""
 

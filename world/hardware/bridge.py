@@ -209,10 +209,10 @@ class Field:
         """Wait until tick 0 can begin: for the first robot when all agents are connected, then for the rest.
 
         A resumed process only waits for its own agent, because the mission of others may have ended. The
-        TickStart of a robot that now waits for this one may have been lost: just after two routers have
-        connected, Zenoh loses messages, and a process that was killed before tick 0 may have received it. A
-        robot therefore begins UNHEARD ticks after all are connected. One of a group begins at `give_up`
-        without those that are missing, if any other is there. Its agent is told every WAITING_S.
+        TickStart of a robot that now waits for this one may be lost: Zenoh loses what is sent just after two
+        routers have connected, and this process may have been killed since. A robot therefore begins UNHEARD
+        ticks after all are connected. One of a group begins at `give_up` without those that are missing, if
+        any other is there. Meanwhile its agent is told every WAITING_S that it waits.
 
         Raises NoStart.
         """
