@@ -117,6 +117,49 @@ def test_a_stream_gives_what_its_file_gives(messages: Messages) -> None:
             assert abs(row.y - other.y) < 0.05
 
 
+def test_a_long_stream_is_estimated_from_its_last_part(
+    messages: Messages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimate_run, "MOST_S", 24.0)
+    monkeypatch.setattr(estimate_run, "KEPT_S", 20.0)
+    followed = StreamEstimate("it", ("A", "B"), told_noise(PROFILE), ClaimRule())
+    rows = list(followed.rows(rows_as_they_arrive(io.BytesIO(written(messages)), "it")))
+    measured, result = followed.result()
+    whole = measurements(read_ranges(SAMPLE), None, PROFILE, None, ticks=estimate_run.STREAM_TICKS)
+    assert result.summary.begin_s == pytest.approx(whole.t0)
+    assert measured.t0 > whole.t0 + 3.0
+    assert len(measured.path("A").v) * measured.joint.period <= estimate_run.MOST_S
+    later = [row for row in rows if row.t_s > whole.t0 + 24.5]
+    assert later
+    assert all(row.claim for row in later)
+    begin = measured.t0 - min(one.odometry.t0[0] for one in read_ranges(SAMPLE).robots)
+    part = measurements(read_ranges(SAMPLE), None, PROFILE, (begin, 60.0), ticks=estimate_run.STREAM_TICKS)
+    of_part = estimated(part, ClaimRule()).rows
+    for row in later:
+        other = min(
+            [one for one in of_part if one.robot == row.robot], key=lambda one: abs(one.t_s - row.t_s)
+        )
+        assert other.t_s == pytest.approx(row.t_s, abs=0.06)
+        assert (row.x, row.y) == pytest.approx((other.x, other.y), abs=0.05)
+
+
+def test_nothing_of_a_stream_is_forgotten_while_a_robot_stands(
+    messages: Messages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimate_run, "MOST_S", 10.0)
+    monkeypatch.setattr(estimate_run, "KEPT_S", 4.0)
+    still = [
+        (t, topic, {**row, "dx": 0.0, "dy": 0.0, "dheading": 0.0} if topic == "/odometry" else row)
+        for t, topic, row in messages
+        if t <= 14.0
+    ]
+    followed = StreamEstimate("it", ("A", "B"), told_noise(PROFILE), ClaimRule())
+    for _ in followed.rows(rows_as_they_arrive(io.BytesIO(written(still)), "it")):
+        pass
+    measured, result = followed.result()
+    assert measured.t0 == result.summary.begin_s
+
+
 def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Messages) -> None:
     late = [
         one

@@ -96,7 +96,7 @@ class Drawn(NamedTuple):
 
     def since_begin(self, times: Any) -> Numbers:
         """Return times in s from the first odometry of both robots on."""
-        return np.asarray(times, float) - self.problem.t0
+        return np.asarray(times, float) - self.estimates.summary.begin_s
 
 
 def _robots(problem: Measurements, estimates: RecordingEstimate) -> list[Estimated]:
@@ -109,7 +109,7 @@ def _robots(problem: Measurements, estimates: RecordingEstimate) -> list[Estimat
         if count <= len(ROLES):
             hue, marks = COLOURS[ROLES[i]], ROLE_MARKERS[ROLES[i]]
         rows = [row for row in estimates.rows if row.robot == one.id]
-        times = np.array([row.t_s for row in rows]) - problem.t0
+        times = np.array([row.t_s for row in rows]) - estimates.summary.begin_s
         found.append(Estimated(one.id, hue, marks, rows, one.recorded.truth, times))
     return found
 

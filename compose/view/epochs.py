@@ -45,7 +45,7 @@ def played(problem: Measurements, estimate: RecordingEstimate) -> PlayedEstimate
         return np.sort(order[slice(*np.searchsorted(of_epoch, (number, number + 1)))])
 
     epochs = [_epoch(problem, 0, 0, problem.t0, measured(0), (), ())]
-    for one in estimate.epochs:
+    for one in [each for each in estimate.epochs if each.t > problem.t0]:
         tick = max(round((one.t - problem.t0) / EPOCH_S), epochs[-1].tick + 1)
         number = int(np.searchsorted(problem.ends, one.t - SAME_TIME_S)) + 1
         epochs.append(_epoch(problem, tick, number, one.t, measured(number), one.rows, one.hypotheses))

@@ -19,7 +19,7 @@ from agent.estimation.gaussian.joint_ranges import (
     Silence,
     prior_of,
 )
-from agent.estimation.gaussian.odometry_noise import Track, track
+from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from protocol.noise import Noise
 
@@ -73,7 +73,7 @@ def near_anchors(
 def of_rows(
     places: Mapping[str, AnchorPlace],
     starts: Mapping[str, StartPose],
-    steps: Mapping[str, Sequence[Manoeuvre]],
+    steps: Mapping[str, Sequence[Manoeuvre] | Array],
     measured: Iterable[MeasuredRow],
     noise: Noise,
     period: float,
@@ -81,9 +81,9 @@ def of_rows(
 ) -> JointMeasurements:
     """Return what was `measured` by robots whose manoeuvres from tick 0 on are in `steps`.
 
-    `places` are those of the anchors, and `starts` those of the robots that have one. Ticks last `period` s,
-    and no range above `reach` m is expected. Ranges after the path of a robot are not used, nor those to
-    anchors that have no place.
+    Manoeuvres may also be the rows of an array, (K, 5). `places` are those of the anchors, and `starts` those
+    of the robots that have one. Ticks last `period` s, and no range above `reach` m is expected. Ranges after
+    the path of a robot are not used, nor those to anchors that have no place.
     """
     surveyed, robots = {name: one for name, one in places.items() if not one.sigma}, sorted(steps)
     rows = [
@@ -102,7 +102,7 @@ def of_rows(
     first = sorted(used, key=lambda name: places[name].sigma)[:1]
     origin = places[first[0]] if first else AnchorPlace(0.0, 0.0)
     at = [surveyed.get(row.second, origin) for row in rows]
-    standing = _path([Manoeuvre(0.0, 0.0)] * max(map(len, steps.values()), default=0), period)
+    standing = _path(np.zeros((max(map(len, steps.values()), default=0), 5)), period)
     relative = [
         one and one._replace(x=one.x - origin.x, y=one.y - origin.y)
         for one in (*map(starts.get, robots), *map(places.get, unsure))
@@ -149,7 +149,7 @@ def _prior(poses: Sequence[AnchorPlace | StartPose | None], of_start: float) -> 
     return prior_of(mean, information)
 
 
-def _path(steps: Sequence[Manoeuvre], period: float) -> Track:
+def _path(steps: Sequence[Manoeuvre] | Array, period: float) -> Track:
     """Return the path of `steps`; without slip or extra variances if all of them are 0."""
     v, omega, slip, *extra = np.array(steps, np.float64).reshape(-1, 5).T
     path = track(v + 0.0, omega + 0.0, period, slip if slip.any() else None)

@@ -3,6 +3,8 @@
 In a stream, an epoch is computed as soon as the odometry of all robots has reached its end. Rows must arrive
 in the order of time, as in a file: a range that comes later counts from the next epoch on. A range of a robot
 without odometry waits for its first increment, for at most LONG_GAP_S.
+
+So that the time of an epoch is bounded, an estimate begins again with the last KEPT_S when it has MOST_S.
 """
 
 from __future__ import annotations
@@ -10,6 +12,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import NamedTuple
 
+import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.following import ClaimRule
@@ -22,6 +25,7 @@ from compose.recording.estimating.recorded_measurements import (
     EPOCH_S,
     Measurements,
     NoAnchors,
+    longest_possible,
     measurements,
     numerics,
 )
@@ -34,6 +38,18 @@ from compose.recording.ranging.recording_rows import AnyRow, OdometryRow, PoseRo
 STREAM_TICKS = 20
 """The number of ticks in an epoch of a stream. A robot of 0.5 m/s then moves by a quarter of 0.05 m in half a
 tick; the speed of the robots is not known before they have moved."""
+
+MOST_S, KEPT_S = 240.0, 120.0
+"""The time in s of a stream with which the estimate begins again, and the part that it then begins with.
+
+With less, robots with few ranges do not claim their poses; with more, an epoch takes longer.
+"""
+
+LEAST_WAY = 0.25
+"""The least extent of a robot's path in that part, as a fraction of the longest range.
+
+Of a robot that stands for long, only older ranges tell the heading: then nothing is forgotten.
+"""
 
 EXAMINED_AFTER_S = 4.0
 """The time in s after which the units are examined for the first time, then whenever it has doubled."""
@@ -72,6 +88,18 @@ def _result(measured: Measurements, estimator: RecordingEstimator) -> RecordingE
         return RecordingEstimate(estimator.past, summary_of(measured, estimator.past, estimator.rule))
 
 
+def _may_forget(measured: Measurements) -> bool:
+    """Return whether the last KEPT_S tell all that is known of the robots, as far as it tells poses now.
+
+    They do not in the frame of a robot, nor if an anchor is not surveyed, or a robot hardly moves in them.
+    """
+    joint = measured.joint
+    if measured.relative_to is not None or joint.surveyed:
+        return False
+    since, least = -round(KEPT_S / joint.period), LEAST_WAY * longest_possible(joint)
+    return all(float(np.hypot(*np.ptp(one.place[:, since:], axis=1))) >= least for one in joint.paths)
+
+
 class StreamEstimate:
     """An estimate that grows with the rows of a stream."""
 
@@ -97,6 +125,8 @@ class StreamEstimate:
         self._estimator = RecordingEstimator(rule, solver)
         self._measured: Measurements | None = None
         """The measurements of the last epoch."""
+        self._begin_s: float | None = None
+        """The time in s from which on there is odometry of all robots in the estimate."""
         self._doubt = ""
         self._count = 0
         """The number of robots in the estimate."""
@@ -117,7 +147,7 @@ class StreamEstimate:
         if not names or not all(name in spans for name in names):
             return
         if len(names) > self._count:  # the estimates so far are kept, and are of other robots
-            self._count = len(names)
+            self._count, self._begin_s = len(names), None
             self._estimator.begin()
             self._due_after_s, self._examined_after_s = EPOCH_S, EXAMINED_AFTER_S
         lasts = min(spans[name][1] for name in names) - max(spans[name][0] for name in names)
@@ -143,10 +173,16 @@ class StreamEstimate:
         self._doubt = measured.doubt
         last = measured if self._measured is None or not self._estimator.past else self._measured
         self._measured = replace(last, doubt=measured.doubt)
+        if self._begin_s is None:
+            self._begin_s = measured.t0
         for epoch in self._estimator.epochs(measured):
             self._measured = measured
             yield from epoch.rows
         self._due_after_s = max([measured.t0, *measured.ends[-1:].tolist()]) - measured.t0 + EPOCH_S
+        if lasts >= MOST_S and _may_forget(measured):
+            self._builder.forget(measured.t0 + lasts - KEPT_S)
+            self._estimator.begin()
+            self._due_after_s, self._examined_after_s = EPOCH_S, MOST_S
 
     def result(self) -> tuple[Measurements, RecordingEstimate]:
         """Return all estimates so far. Raises UserError if no epoch is complete."""
@@ -154,4 +190,6 @@ class StreamEstimate:
             what = "no second with odometry of all robots"
             what += " and ranges to two anchors" if self._relative is None else ""
             raise UserError(f"{self._builder.source}: there is {what}")
-        return self._measured, _result(self._measured, self._estimator)
+        estimate = _result(self._measured, self._estimator)
+        begin_s = self._measured.t0 if self._begin_s is None else self._begin_s
+        return self._measured, estimate._replace(summary=replace(estimate.summary, begin_s=begin_s))

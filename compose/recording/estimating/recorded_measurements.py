@@ -15,7 +15,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.estimation.facts import AnchorPlace, Manoeuvre, MeasuredRange, MeasuredRow, StartPose
+from agent.estimation.facts import AnchorPlace, MeasuredRange, MeasuredRow, StartPose
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.measured_rows import of_rows
 from agent.estimation.gaussian.odometry_noise import Track
@@ -345,8 +345,8 @@ def _ranges(
             yield MeasuredRow(False, robot, other, tick, measured)
 
 
-def _manoeuvres(increments: Numbers, covariance: Numbers, period: float) -> list[Manoeuvre]:
-    """Return the motion in each step of `period` s, with the variances of the increments.
+def _manoeuvres(increments: Numbers, covariance: Numbers, period: float) -> Numbers:
+    """Return the motion in each step of `period` s, with the variances of the increments; see `of_rows`.
 
     The error sideways is not used: a path has none but that of its heading.
     """
@@ -361,8 +361,7 @@ def _manoeuvres(increments: Numbers, covariance: Numbers, period: float) -> list
     along = np.stack((np.cos(half + slip), np.sin(half + slip)), 1)
     v_variance = np.einsum("ki,kij,kj->k", along, covariance[:, :2, :2], along) / np.square(unit)
     v = np.where(backwards, -moved, moved) / unit
-    columns = np.stack((v, turn / period, slip, v_variance, covariance[:, 2, 2] / period**2), 1)
-    return [Manoeuvre(*row) for row in (columns + 0.0).tolist()]
+    return np.stack((v, turn / period, slip, v_variance, covariance[:, 2, 2] / period**2), 1) + 0.0
 
 
 class NoAnchors(UserError):

@@ -138,6 +138,16 @@ class RecordingBuilder:
         self._add_jump(row, path[-1][0].t1 if path else row.t0, place)
         path.append((row, covariance))
 
+    def forget(self, before_s: float) -> None:
+        """Forget what was measured before this time, but for the last increment of each robot."""
+        for rows in self._odometry.values():
+            rows[:-1] = [one for one in rows[:-1] if one[0].t1 > before_s]
+        for path in self._truth.values():
+            path[:-1] = [one for one in path[:-1] if one.t > before_s]
+        for jumps in self._jumps.values():
+            jumps[:] = [one for one in jumps if one.end_s > before_s]
+        self._ranges = [one for one in self._ranges if one[0].t > before_s]
+
     def _add_pose(self, row: PoseRow, place: object) -> None:
         """Add the increment from the pose before to this one. The same pose again is none."""
         before = self._poses.get(row.robot)
