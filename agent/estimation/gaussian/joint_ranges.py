@@ -368,10 +368,12 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         steps = _longest(np.diff(way))
         moved = np.append(True, steps > near)
         if np.any((steps > 0.0) & (steps <= near)):  # slow motion adds up
-            last = way[..., 0]
-            for one in range(1, len(ticks)):
-                moved[one] = _longest(way[..., one] - last) > near
-                last = way[..., one] if moved[one] else last
+            places = way.transpose(2, 0, 1).tolist()
+            last = places[0]
+            for one, now in enumerate(places):
+                away = [(x - u, y - v) for (x, y), (u, v) in zip(now, last, strict=True)]
+                moved[one] = one == 0 or any(math.sqrt(x * x + y * y) > near for x, y in away)
+                last = now if moved[one] else last
         return np.flatnonzero(moved)
 
     @property
