@@ -295,16 +295,15 @@ class RecordingBuilder:
             for row, place in self._ranges
             if row.t <= through_s or (row.first in radios and row.second in radios)
         ]
-        ends = np.empty((len(used), 2), np.intp)
-        for i, (row, place) in enumerate(used):
+        ends = np.array([(radios.get(row.first, -1), radios.get(row.second, -1)) for row, _ in used], np.intp)
+        ends = ends.reshape(-1, 2)
+        wrong = np.flatnonzero((ends.min(axis=1) < 0) | (ends.min(axis=1) >= robots))
+        for row, place in [used[i] for i in wrong[:1]]:
             for name in (row.first, row.second):
                 if name not in radios:
                     raise BadRecording(f"{place}: {name} {self._unknown(name, names)}")
-            ends[i] = radios[row.first], radios[row.second]
-            if min(ends[i]) >= robots:
-                raise BadRecording(f"{place}: {row.first} and {row.second} are both anchors")
-            if ends[i, 0] >= robots:
-                ends[i] = ends[i, ::-1]
+            raise BadRecording(f"{place}: {row.first} and {row.second} are both anchors")
+        ends = np.where(ends[:, :1] >= robots, ends[:, ::-1], ends)
         lengths = [(row.t, row.range, np.nan if row.sigma is None else row.sigma) for row, _ in used]
         t, measured, sigma = _table(lengths, 3).T
         unsorted = RangeSeries(t, ends[:, 0], ends[:, 1], measured, sigma)
