@@ -64,7 +64,7 @@ class WorldProcess:
         *,
         rate: float | None = None,
         timeout: float = 30.0,
-        on_kill_point: Callable[[str, int], None] | None = None,
+        on_kill_point: Callable[[str, int], None] = lambda *_: None,
     ) -> None:
         """Run `simulation`, which may be a resumed one, under the run name `run`.
 
@@ -146,11 +146,9 @@ class WorldProcess:
         try:
             while end is None:
                 commands = self._answers(simulation.observations(), due)
-                if self._on_kill_point is not None:
-                    self._on_kill_point("command", simulation.tick)
+                self._on_kill_point("command", simulation.tick)
                 simulation.journal_commands(commands)
-                if self._on_kill_point is not None:
-                    self._on_kill_point("journal", simulation.tick)
+                self._on_kill_point("journal", simulation.tick)
                 end = simulation.advance(commands)
                 self._began = self._inbox.clock() if self._began is None else self._began
                 if self._period is not None:
@@ -177,11 +175,9 @@ class WorldProcess:
         """
         tick = self._simulation.tick
         frames = {observation.robot: encode(observation) for observation in observations}
-        if self._on_kill_point is not None:
-            self._on_kill_point("observation", tick)
+        self._on_kill_point("observation", tick)
         self._put(frames)
-        if self._on_kill_point is not None:
-            self._on_kill_point("report", tick)
+        self._on_kill_point("report", tick)
         self._show_truth()
         commands: dict[str, Command] = {}
         now = self._inbox.clock()

@@ -60,7 +60,7 @@ class AgentProcess:
         *,
         timeout: float = 30.0,
         launched: bool = False,
-        on_kill_point: Callable[[str, int], None] | None = None,
+        on_kill_point: Callable[[str, int], None] = lambda *_: None,
     ) -> None:
         """Continue from `memory`, in the run named `run`.
 
@@ -209,8 +209,7 @@ class AgentProcess:
     def _on_observation(self, observation: Observation, frame: bytes) -> bool:
         """Process an Observation and return whether it is in step. Raises NoWorld."""
         if observation.tick == self._latest_tick + 1:
-            if self._on_kill_point is not None:
-                self._on_kill_point("observation", observation.tick)
+            self._on_kill_point("observation", observation.tick)
             if self._due is not None:  # the world has advanced; absent reports count as missed
                 self._due = -math.inf
                 self._decide_when_reports_complete()
@@ -267,15 +266,12 @@ class AgentProcess:
     def _send_reports(self, reports: Mapping[str, FramedReport]) -> None:
         for peer, framed in reports.items():
             self._link.report(peer, framed.frame)
-            if self._on_kill_point is not None:
-                self._on_kill_point("report", framed.report.tick)
+            self._on_kill_point("report", framed.report.tick)
 
     def _send_command(self, tick: int) -> None:
-        if self._on_kill_point is not None:
-            self._on_kill_point("journal", tick)
+        self._on_kill_point("journal", tick)
         self._link.command(self._robot.command_frame)
-        if self._on_kill_point is not None:
-            self._on_kill_point("command", tick)
+        self._on_kill_point("command", tick)
 
     def _repeat_answers(self) -> None:
         """Send the stored answers again, for a process that was restarted and may have lost them.

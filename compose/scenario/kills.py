@@ -123,13 +123,11 @@ def parse(text: str) -> Kill:
     return Kill(match["who"], int(match["tick"]), point, after, text)
 
 
-def taker(kills: Sequence[Kill]) -> Callable[[str, int], None] | None:
-    """Return a callback that kills this process at its scheduled points; None if there are no `kills`.
+def taker(kills: Sequence[Kill]) -> Callable[[str, int], None]:
+    """Return a callback that kills this process at its scheduled points.
 
     The process calls it with the point and the tick at every point of every tick.
     """
-    if not kills:
-        return None
     fatal: dict[tuple[str, int], Kill] = {(kill.point, kill.tick): kill for kill in kills}
 
     def on_kill_point(point: str, tick: int) -> None:
