@@ -94,8 +94,7 @@ class SensorModel(msgspec.Struct, frozen=True):
 
     def detects(
         self,
-        sensor: str,
-        robot: str,
+        ranging: RangeSensor,
         tick: int,
         rho: float,
         pattern: float,
@@ -105,7 +104,7 @@ class SensorModel(msgspec.Struct, frozen=True):
         """Return whether two radios detect each other in a tick.
 
         `rho` is their distance in m, `pattern` the relative range of their patterns in this direction.
-        `sensor` and `robot` are the key of the random stream. `model` decides for `radios` instead of a disc.
+        `model` decides for `radios` instead of a disc.
         """
         reach = self.reach * pattern
         if model is not None and radios is not None:
@@ -117,7 +116,7 @@ class SensorModel(msgspec.Struct, frozen=True):
         if exponent is None:
             return True
         missed: float = (rho / reach) ** exponent
-        return uniform(self.seed, f"{sensor}-detection", robot, tick) >= missed
+        return uniform(self.seed, f"{ranging.sensor}-detection", ranging.robot, tick) >= missed
 
     def measured(self, ranging: RangeSensor, rho: float, tick: int) -> float | None:
         """Return the range in m that is measured at the true distance `rho` m; None for a drop-out."""

@@ -16,9 +16,9 @@ from protocol.noise import VelocityNoise
 from world.near_pairs import near_pairs
 from world.random_streams import gaussian
 from world.scenario import Scenario
-from world.sensor_model import LONGEST_RANGE
+from world.sensor_model import LONGEST_RANGE, RangeSensor
 from world.truth import Truth
-from world.world_models import Radios, RangeModel
+from world.world_models import Point, Radios
 
 
 def anchor_ranges(truth: Truth, scenario: Scenario) -> list[list[NamedRange]]:
@@ -35,25 +35,18 @@ def anchor_ranges(truth: Truth, scenario: Scenario) -> list[list[NamedRange]]:
 
 def _anchor_range(truth: Truth, scenario: Scenario, i: int, name: str, anchor: Anchor) -> float | None:
     """Return the measured range of robot `i` to the anchor called `name`, in m; None if there is none."""
-    sensors, model, radios = scenario.sensors, scenario.ranging, None
-    robot, pose, origin = scenario.robots[i].id, truth.local[i], truth.origins[i]
-    if sensors.exact and model is None:
+    sensors, robot, pose, origin = scenario.sensors, scenario.robots[i].id, truth.local[i], truth.origins[i]
+    if sensors.exact and scenario.ranging is None:
         return _exact_range(pose.x - (anchor.x - origin.x), pose.y - (anchor.y - origin.y), sensors.reach)
     sensor, (off_x, off_y) = sensors.anchors[robot, name], sensors.survey[name]
     x, y = pose.x - (anchor.x - origin.x) - off_x, pose.y - (anchor.y - origin.y) - off_y
     rho = math.hypot(x, y)
     pattern = sensors.anchor_lobes[name].reach(math.atan2(y, x)) if sensors.world.lobe_depth else 1.0
-    if model is not None:
-        surveyed = (anchor.x + off_x, anchor.y + off_y)
-        at = (x + surveyed[0], y + surveyed[1])
-        radios = Radios(f"anchor/{sensor.robot}", at, surveyed, truth.tick, scenario.seed)
-    if not sensors.detects("anchor", sensor.robot, truth.tick, rho, pattern, model, radios):
-        return None
-    if sensors.exact:
-        return rho
-    late = truth.before(sensors.world.range_delay)[i]
-    rho = math.hypot(x + (late.x - pose.x), y + (late.y - pose.y))
-    return _modelled(sensors.measured(sensor, rho, truth.tick), model, radios)
+    surveyed, before = (anchor.x + off_x, anchor.y + off_y), truth.before(sensors.world.range_delay)[i]
+    at = (x + surveyed[0], y + surveyed[1])
+    late = math.hypot(x + (before.x - pose.x), y + (before.y - pose.y))
+    found = _measured(scenario, truth.tick, sensor, (at, surveyed), (rho, late, pattern))
+    return None if found is None else found.range
 
 
 class Mutual(NamedTuple):
@@ -82,18 +75,18 @@ def in_contact(
 
 def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, int]]) -> list[Mutual | None]:
     """Return the measurement of each pair; None if its robots are out of range of each other."""
-    sensors, model, radios = scenario.sensors, scenario.ranging, None
+    sensors = scenario.sensors
     ranges: list[Mutual | None] = []
-    if sensors.exact and model is None:
+    if sensors.exact and scenario.ranging is None:
         for i, j in pairs:
             one, other = truth.local[i], truth.local[j]
             exact = _exact_range(one.x - other.x, one.y - other.y, sensors.reach)
             ranges.append(None if exact is None else Mutual(exact))
         return ranges
-    lobed, late = sensors.world.lobe_depth, truth.before(sensors.world.range_delay)
+    lobed, before = sensors.world.lobe_depth, truth.before(sensors.world.range_delay)
+    places = [(pose.x, pose.y) for pose in truth.poses]
     for i, j in pairs:
-        sensor = sensors.mutual[i, j]
-        one, other, robot = truth.local[i], truth.local[j], sensor.robot
+        one, other = truth.local[i], truth.local[j]
         x, y = one.x - other.x, one.y - other.y
         rho, pattern = math.hypot(x, y), 1.0
         if lobed:
@@ -101,23 +94,9 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
             of_one = sensors.robot_lobes[i].reach(to_other - one.heading)
             of_other = sensors.robot_lobes[j].reach(to_one - other.heading)
             pattern = 0.5 * (of_one + of_other)
-        if model is not None:
-            places = truth.poses
-            radios = Radios(
-                f"mutual/{robot}",
-                (places[i].x, places[i].y),
-                (places[j].x, places[j].y),
-                truth.tick,
-                scenario.seed,
-            )
-        if not sensors.detects("mutual", robot, truth.tick, rho, pattern, model, radios):
-            ranges.append(None)
-        elif sensors.exact:
-            ranges.append(Mutual(rho))
-        else:
-            rho = math.hypot(late[i].x - late[j].x, late[i].y - late[j].y)
-            measured = sensors.measured(sensor, rho, truth.tick)
-            ranges.append(Mutual(_modelled(measured, model, radios)))
+        late = math.hypot(before[i].x - before[j].x, before[i].y - before[j].y)
+        ends, distances = (places[i], places[j]), (rho, late, pattern)
+        ranges.append(_measured(scenario, truth.tick, sensors.mutual[i, j], ends, distances))
     return ranges
 
 
@@ -127,12 +106,30 @@ def _exact_range(x: float, y: float, reach: float) -> float | None:
     return rho if rho <= reach else None
 
 
-def _modelled(rho: float | None, model: RangeModel | None, radios: Radios | None) -> float | None:
-    """Return the range that is measured under `model`, within the bounds of a range."""
-    if rho is None or model is None or radios is None:
-        return rho
-    measured = model.measured(radios, rho)
-    return None if measured is None else min(max(0.0, float(measured)), LONGEST_RANGE)
+def _measured(
+    scenario: Scenario,
+    tick: int,
+    sensor: RangeSensor,
+    places: tuple[Point, Point],
+    distances: tuple[float, float, float],
+) -> Mutual | None:
+    """Return the measurement of two radios at `places`; None if they do not detect each other.
+
+    The `distances` are theirs in m, that of the time of the measurement, and the relative range of their
+    patterns in this direction.
+    """
+    sensors, model, (rho, late, pattern), radios = scenario.sensors, scenario.ranging, distances, None
+    if model is not None:
+        radios = Radios(f"{sensor.sensor}/{sensor.robot}", *places, tick, scenario.seed)
+    if not sensors.detects(sensor, tick, rho, pattern, model, radios):
+        return None
+    if sensors.exact:
+        return Mutual(rho)
+    measured = sensors.measured(sensor, late, tick)
+    if measured is not None and model is not None and radios is not None:
+        modelled = model.measured(radios, measured)
+        measured = None if modelled is None else min(max(0.0, float(modelled)), LONGEST_RANGE)
+    return Mutual(measured)
 
 
 def executed(limited_controls: Controls, scenario: Scenario, robot: str, tick: int) -> Controls:
