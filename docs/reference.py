@@ -71,7 +71,7 @@ from tests.expected import tables as expected_tables
 from tests.expected.tables import table as results_of
 from world.radio_models import RADIO_MODELS
 from world.range_models import RANGE_MODELS
-from world.world_noise import WorldActuationNoise, WorldNoise, WorldOdometryNoise
+from world.world_noise import WorldNoise, WorldOdometryNoise, WorldVelocityNoise
 
 DOCS = Path(__file__).parent
 BEGIN = re.compile(r"^<!-- written by docs/reference.py: (?P<name>[\w-]+) -->$", re.MULTILINE)
@@ -118,7 +118,7 @@ NAMES = {
     "Noise": "table",
     "VelocityNoise": "table",
     "WorldNoise": "table",
-    "WorldActuationNoise": "table",
+    "WorldVelocityNoise": "table",
     "WorldOdometryNoise": "table",
     "RowTable": "table",
 }
@@ -414,7 +414,7 @@ TABLES: dict[str, Callable[[], str]] = {
     "velocity-noise": partial(fields_of, VelocityNoise),
     "world": partial(fields_of, WorldTable),
     "world-noise": partial(fields_of, WorldNoise),
-    "world-actuation-noise": partial(fields_of, WorldActuationNoise),
+    "world-actuation-noise": partial(fields_of, WorldVelocityNoise),
     "world-odometry-noise": partial(fields_of, WorldOdometryNoise),
     "fault": partial(fields_of, FaultTable),
     "kill": partial(fields_of, KillTable),

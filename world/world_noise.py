@@ -26,8 +26,8 @@ Distribution = Literal["gaussian", "laplace", "student-t", "exponential"]
 T = TypeVar("T")
 
 
-class WorldActuationNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The noise of actuation. A field that is left out has the value of `[mission.noise.actuation]`."""
+class WorldVelocityNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """White noise of v and omega. A field that is left out has the value that the robots are told."""
 
     v: Fraction | None = None
     """The proportional standard deviation of v, as a fraction of v."""
@@ -39,20 +39,9 @@ class WorldActuationNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=Tru
     """The absolute standard deviation of omega, in rad/s."""
 
 
-class WorldOdometryNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The noise of odometry.
+class WorldOdometryNoise(WorldVelocityNoise, frozen=True, forbid_unknown_fields=True):
+    """The noise of odometry: white noise, errors that are constant or slow, a delay, and strays."""
 
-    One of the first four fields that is left out has the value of `[mission.noise.odometry]`.
-    """
-
-    v: Fraction | None = None
-    """The proportional standard deviation of v, as a fraction of v."""
-    omega: Fraction | None = None
-    """The proportional standard deviation of omega, as a fraction of omega."""
-    v_floor: Floor | None = None
-    """The absolute standard deviation of v, in m/s."""
-    omega_floor: Floor | None = None
-    """The absolute standard deviation of omega, in rad/s."""
     scale: RelativeError | dict[RobotId, RelativeError] = 0.0
     """The relative error of the measured v, constant over the mission: of all robots, or by robot."""
     scale_sigma: Fraction = 0.0
@@ -89,7 +78,7 @@ class WorldNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """The minimum and maximum of the uniformly distributed bias of an outlier, in m."""
     drop_outs: Probability | None = None
     """The probability that a range within R is not measured."""
-    actuation: WorldActuationNoise = WorldActuationNoise()
+    actuation: WorldVelocityNoise = WorldVelocityNoise()
     """The difference between commanded and executed velocities."""
     odometry: WorldOdometryNoise = WorldOdometryNoise()
     """The difference between executed and measured velocities."""
@@ -148,7 +137,7 @@ class WorldNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     def is_shared(self) -> bool:
         """True if robots can assume all of it: only the fields of `[mission.noise]` are set."""
         odometry = replace(self.odometry, **dict.fromkeys(VELOCITY_FIELDS))
-        rest = replace(self, **dict.fromkeys(RANGE_FIELDS), actuation=WorldActuationNoise())
+        rest = replace(self, **dict.fromkeys(RANGE_FIELDS), actuation=WorldVelocityNoise())
         return replace(rest, odometry=odometry) == WorldNoise()
 
     def changes_nothing(self, told: Noise) -> bool:
