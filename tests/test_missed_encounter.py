@@ -142,7 +142,7 @@ def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:
 def knowledge(config: RobotConfig, ticks: list[int], mutual: tuple[int, ...] = ()) -> Knowledge:
     """Return what a robot of the role in `config` knows if a was ranged by its anchor at `ticks`."""
     log = MotionLog(200, (), tuple([Ranged(tick, 1.0) for tick in ticks]))
-    known = Knowledge(config, tick=200, mutual=tuple([Ranged(tick, 2.0) for tick in mutual]))
+    known = Knowledge(config, tick=200, ranges={config.peer: tuple([Ranged(tick, 2.0) for tick in mutual])})
     return replace(known, log=log) if config.role == "a" else replace(known, peer_state=PeerState(peer=log))
 
 

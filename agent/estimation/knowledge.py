@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import msgspec
 
@@ -100,7 +101,8 @@ class Knowledge(msgspec.Struct, frozen=True):
     odometry: Pose = ORIGIN
     """The current pose in the frame of the pose at tick 0, by dead reckoning."""
     log: MotionLog = MotionLog()
-    mutual: tuple[Ranged, ...] = ()
+    ranges: Mapping[str, tuple[Ranged, ...]] = {}
+    """The ranges to each other robot."""
     own_anchor: OwnAnchor = OwnAnchor()
     belief: Belief = Belief()
     peer_state: PeerState = PeerState()
@@ -111,6 +113,11 @@ class Knowledge(msgspec.Struct, frozen=True):
     def knowledge(self) -> Knowledge:
         """Return this knowledge alone, without what a subclass adds to it."""
         return Knowledge(**{name: getattr(self, name) for name in Knowledge.__struct_fields__})
+
+    @property
+    def mutual(self) -> tuple[Ranged, ...]:
+        """Return the ranges to the peer."""
+        return self.ranges.get(self.config.peer, ())
 
     @property
     def start(self) -> Pose:

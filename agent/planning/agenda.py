@@ -10,7 +10,7 @@ import msgspec
 
 from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Knowledge
-from protocol.messages import Localised, Ranged, ReportedPose, Verdict
+from protocol.messages import Localised, ReportedPose, Verdict
 from protocol.motion import ORIGIN, Pose
 
 if TYPE_CHECKING:
@@ -19,10 +19,8 @@ if TYPE_CHECKING:
 
 
 class Other(msgspec.Struct, frozen=True):
-    """The knowledge of a robot about another one of its group, besides the logs of their present meeting."""
+    """The knowledge of a robot about another one of its group, besides its logs and ranges."""
 
-    mutual: tuple[Ranged, ...] = ()
-    """The ranges to it."""
     localised: bool = False
     """True once it has reported that it is localised."""
     failed: bool = False

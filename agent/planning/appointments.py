@@ -159,12 +159,10 @@ def _aligned(state: RobotState) -> RobotState:
 
 def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | None = None) -> RobotState:
     """Return `state` in a new meeting with `peer`, of which the robot knows only its ranges to it."""
-    state = state.with_other(state.config.peer, mutual=state.mutual)
-    mutual = state.other(peer).mutual
+    mutual = state.ranges.get(peer, ())
     return replace(
         state,
         config=state.config.in_meeting(peer, role, orbits),
-        mutual=mutual,
         in_contact=bool(mutual) and mutual[-1].tick == state.tick,
         belief=Belief(earlier_ranges=len(mutual)),
         peer_state=PeerState(),

@@ -21,11 +21,10 @@ from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.judged import Judged
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow
 from agent.planning import sweep
-from agent.planning.agenda import Other
 from agent.planning.state import RobotState
 from agent.planning.sweep import LINGER, ticks_since
 from agent.planning.tasks import Done, Looping, Sweeping, transformed
-from protocol.messages import Localised, Report, ReportedPose
+from protocol.messages import Localised, Ranged, Report, ReportedPose
 from protocol.motion import Covariance, compose, inverse
 from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, Place, surveyed_path
 from protocol.sweep_ticks import contact_ticks
@@ -103,7 +102,7 @@ def begun(state: RobotState, part: int) -> RobotState:
         state = replace(
             state,
             config=known.config,
-            mutual=known.mutual,
+            ranges={**state.ranges, known.config.peer: known.mutual},
             own_anchor=known.own_anchor,
             belief=known.belief,
             peer_state=known.peer_state,
@@ -170,15 +169,15 @@ def _stops_for(state: RobotState, robot: str) -> bool:
     covariance = reference.covariance if reference is not None else None
     if covariance is None or covariance.position_sigma > WORTH * mission.accuracy:
         return False
-    return _has_passed(state.other(robot), state.tick, STRIP_REACH * mission.sensing_range)
+    return _has_passed(state.ranges[robot], state.tick, STRIP_REACH * mission.sensing_range)
 
 
-def _has_passed(other: Other, tick: int, near: float) -> bool:
+def _has_passed(ranges: Sequence[Ranged], tick: int, near: float) -> bool:
     """Return whether the range to a robot has been at most `near` m, and increases or is out of reach."""
-    latest = other.mutual[-1]
+    latest = ranges[-1]
     if latest.tick < tick:
         return latest.range <= near
-    before = [one.range for one in other.mutual[-2:-1] if one.tick == tick - 1]
+    before = [one.range for one in ranges[-2:-1] if one.tick == tick - 1]
     return bool(before) and min(before) <= near and before[0] <= latest.range
 
 

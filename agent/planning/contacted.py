@@ -149,7 +149,7 @@ def _estimated(state: RobotState, found: Contacted) -> tuple[Contacted, Localise
     first, last = max(finder.reference, state.tick - _kept(state) + 1), min(finder.log.through, state.tick)
     ranges = [
         (one.tick - finder.reference, one.range)
-        for one in state.ranges_to(finder.robot)
+        for one in state.ranges.get(finder.robot, ())
         if first <= one.tick <= last
     ]
     if (

@@ -53,21 +53,17 @@ def observed(state: RobotState, observation: Observation) -> RobotState:
         odometry = step(leg, executed.v, executed.omega, ticks * state.config.mission.period)
     if observation.anchor_range is not None and state.estimator.is_informative(state, observation):
         log = log.ranged(observation.anchor_range)
-    mutual = state.mutual
+    ranges = state.ranges
     for contact in observation.contacts:
-        if contact.range is None:
-            continue
-        latest = Ranged(observation.tick, contact.range)
-        if contact.peer == state.config.peer:
-            mutual = (*mutual, latest)
-        else:
-            state = state.with_other(contact.peer, mutual=(*state.other(contact.peer).mutual, latest))
+        if contact.range is not None:
+            latest = Ranged(observation.tick, contact.range)
+            ranges = {**ranges, contact.peer: (*ranges.get(contact.peer, ()), latest)}
     return replace(
         state,
         tick=observation.tick,
         odometry=odometry,
         log=log,
-        mutual=mutual,
+        ranges=ranges,
         in_contact=any(contact.peer == state.config.peer for contact in observation.contacts),
         leg=leg,
     )

@@ -68,7 +68,7 @@ class Resected(msgspec.Struct, frozen=True):
             key = report.robot, prior.tick
             if key in places or prior.tick <= max(self.since, state.tick - KEPT):
                 continue
-            for one in state.ranges_to(report.robot)[-KEPT:]:
+            for one in state.ranges.get(report.robot, ())[-KEPT:]:
                 if one.tick == prior.tick:
                     moved = _moved(state, self.base, one.tick)
                     places[key] = RangedPlace((prior.pose.x, prior.pose.y), moved, one.range)

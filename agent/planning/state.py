@@ -13,7 +13,7 @@ from agent.estimation.knowledge import Knowledge
 from agent.planning.agenda import Agenda, Other
 from agent.planning.phase3_last_manoeuvre import Plan
 from agent.planning.tasks import Asleep, Done, Looping, Sweeping, Task
-from protocol.messages import Localised, Ranged, Undecided, Verdict
+from protocol.messages import Localised, Undecided, Verdict
 from protocol.motion import ORIGIN, Pose, compose, inverse
 
 
@@ -90,10 +90,6 @@ class RobotState(Knowledge, frozen=True):
     def other(self, robot: str) -> Other:
         """Return what the robot knows of `robot`."""
         return self.agenda.others.get(robot, Other())
-
-    def ranges_to(self, robot: str) -> tuple[Ranged, ...]:
-        """Return the ranges to `robot`."""
-        return self.mutual if robot == self.config.peer else self.other(robot).mutual
 
     def with_other(self, robot: str, **fields: Any) -> RobotState:
         """Return this state with other values of some fields of what the robot knows of `robot`."""

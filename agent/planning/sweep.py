@@ -139,8 +139,8 @@ def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
 
 def ticks_since(state: RobotState, robot: str) -> int:
     """Return the number of ticks since the latest range to `robot`; many if there is none."""
-    mutual = state.other(robot).mutual
-    return state.tick - mutual[-1].tick if mutual else LINGER + 1
+    ranges = state.ranges.get(robot)
+    return state.tick - ranges[-1].tick if ranges else LINGER + 1
 
 
 def _is_near(state: RobotState, robot: str) -> bool:
@@ -148,7 +148,7 @@ def _is_near(state: RobotState, robot: str) -> bool:
     near = STRIP_REACH * state.config.mission.sensing_range
     if ticks_since(state, robot) > 0:
         return False
-    return isinstance(state.task, Looping) or state.other(robot).mutual[-1].range <= near
+    return isinstance(state.task, Looping) or state.ranges[robot][-1].range <= near
 
 
 def moved_on(
