@@ -96,7 +96,7 @@ def test_a_tick_that_an_agent_has_left_out_is_missed(folder: Path) -> None:
     told = [one for one in messages(folder / A) if getattr(one, "tick", None) != 12]
     written(folder / A, told)
     assert [one.line for one in audit(folder).violations] == [
-        "tick 13, a, order: an Observation of tick 13 is out of order"
+        "tick 13, a, order: an Observation of a of tick 13 is out of order"
     ]
 
 
@@ -248,11 +248,11 @@ BY_TWO = "it claims with 2 relative placements with a mutual range, expected at 
 PLANTED: dict[str, tuple[str, Sequence[Edit], str]] = {
     "an agent has not journaled an Observation": (
         *("a", [(of(Observation, 12), nothing)]),
-        "tick 12, a, order: a Command of tick 12 is out of order",
+        "tick 12, a, order: a Command of a of tick 12 is out of order",
     ),
     "an agent has not journaled a Command": (
         *("a", [(of(Command, 12), nothing)]),
-        "tick 12, a, order: an Estimate of tick 12 is out of order",
+        "tick 12, a, order: an Estimate of a of tick 12 is out of order",
     ),
     "an agent has not journaled an Estimate": (
         *("a", [(of(Estimate, 12), nothing)]),

@@ -232,7 +232,7 @@ def test_a_journal_without_one_of_its_ticks_is_refused(folders: tuple[Path, Path
     (tmp_path / "agent-a.journal").write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.out) == (2, "")
-    assert ended.err.endswith("agent-a.journal: an Observation of tick 6 is out of order\n")
+    assert ended.err.endswith("agent-a.journal: an Observation of a of tick 6 is out of order\n")
 
 
 def test_the_audit_checks_the_limits_of_robots_and_their_observations(folders: tuple[Path, Path]) -> None:

@@ -7,16 +7,13 @@ from typing import Any
 
 import msgspec
 
-from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
+from protocol.journal.journal_file import CorruptJournal, JournalReading, UnexpectedFrame, take_all
 from protocol.messages import Command, DeadlineMissed, Environment, FinalReport, MissionEnd
 from protocol.mission import Role
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+from protocol.wire import MalformedFrame
 from world.scenario import PlannedTeam, Scenario
 from world.tick import World, advance, release
 from world.truth import Truth
-
-_AFTER_THE_SCENARIO = Command | DeadlineMissed | MissionEnd | FinalReport
-"""The messages that follow the scenario in a world's journal."""
 
 
 class Tick(msgspec.Struct, frozen=True):
@@ -74,20 +71,19 @@ def world_history(frames: Iterable[bytes], source: object) -> WorldHistory:
     return content
 
 
-class WorldJournalReading:
-    """A reader of a world's journal, frame by frame. The journal may still be growing."""
+class WorldJournalReading(JournalReading):
+    """A reader of a world's journal."""
+
+    KINDS = Environment | Scenario | Command | DeadlineMissed | MissionEnd | FinalReport
 
     def __init__(self, shared: dict[bytes, Any] | None = None) -> None:
-        """`shared` are messages that readers of the same recording have decoded, by frame."""
-        self._shared = {} if shared is None else shared
-        self.environment: Environment | None = None
+        """The `shared` messages are those of JournalReading."""
+        super().__init__(shared)
         self.world: World | None = None
         """The state at the tick after the last complete one, or at the last tick of the run.
 
         None until the scenario has been read.
         """
-        self.messages: list[Any] = []
-        """The messages that have been read, in order."""
         self.ticks: list[Tick] = []
         """The complete ticks."""
         self.recomputed_end: MissionEnd | None = None
@@ -96,25 +92,14 @@ class WorldJournalReading:
         """The recorded end."""
         self.final_reports: dict[str, FinalReport] = {}
         """The recorded FinalReports, by robot."""
-        self.unexpected: UnexpectedFrame | None = None
-        """The first frame out of order."""
         self._ids: list[str] = []
         self._answers: dict[str, Command | DeadlineMissed] = {}
         """The frames of the incomplete tick, by robot."""
 
-    def take(self, frame: bytes) -> bool:
-        """Add the next frame, and return whether it is in order. Add no frame after one that is not.
-
-        Raises MalformedFrame, also if the journal does not begin with a scenario of pairs.
-        """
+    def _fits(self, message: Any, frame: bytes) -> bool:
+        del frame
         if self.world is None:
-            self._begin(frame)
-            return True
-        message = self._shared.get(frame)
-        if not isinstance(message, Command):
-            message = decode(frame, _AFTER_THE_SCENARIO)
-            if isinstance(message, Command):
-                self._shared[frame] = message
+            return self._begins(message)
         tick = self.world.truth.tick
         match message:
             case Command() | DeadlineMissed() if (
@@ -133,33 +118,26 @@ class WorldJournalReading:
             ):
                 self.final_reports[message.robot] = message
             case _:
-                self.unexpected = UnexpectedFrame(getattr(message, "tick", None), _named(message))
                 return False
-        self.messages.append(message)
         return True
 
-    def _begin(self, frame: bytes) -> None:
-        """Take the environment, and then the scenario."""
-        if self.environment is None:
-            message = self._shared.get(frame) or decode(frame, Environment, MAX_FRAME_BYTES)
-            if not isinstance(message, Environment):
-                raise MalformedFrame("a world's journal must begin with its environment")
-            self.environment = message
-            self.messages.append(message)
-            return
-        scenario = self._shared.get(frame)
-        if not isinstance(scenario, Scenario):
-            scenario = decode(frame, Scenario, MAX_FRAME_BYTES)
-        problem = _unpaired(scenario)
-        if problem is not None:
-            raise MalformedFrame(problem)
-        try:
-            _ = scenario.ranging, scenario.radio
-        except (LookupError, TypeError, ValueError) as error:
-            raise MalformedFrame(error.args[0] if error.args else type(error).__name__) from None
-        self._ids = [robot.id for robot in scenario.robots]
-        self.world = release(scenario)
-        self.messages.append(scenario)
+    def _begins(self, message: object) -> bool:
+        """Add the environment, and then the scenario, which must be one of pairs, a group or a team."""
+        match message:
+            case Environment() if self.environment is None:
+                self.environment = message
+            case Scenario() if self.environment is not None:
+                if (problem := _unpaired(message)) is not None:
+                    raise MalformedFrame(problem)
+                try:
+                    _ = message.ranging, message.radio
+                except (LookupError, TypeError, ValueError) as error:
+                    raise MalformedFrame(error.args[0] if error.args else type(error).__name__) from None
+                self._ids = [robot.id for robot in message.robots]
+                self.world = release(message)
+            case _:
+                raise MalformedFrame("a world's journal must begin with its environment and a scenario")
+        return True
 
     def _advance(self, world: World) -> None:
         commands = {
@@ -256,9 +234,3 @@ def _still_to_come(ids: list[str], final_reports: Iterable[str]) -> list[str]:
     """Return the robots whose FinalReport may be next. Those that sent one are in the scenario's order."""
     last = [ids.index(robot) for robot in final_reports][-1:]
     return ids[last[0] + 1 :] if last else ids
-
-
-def _named(message: Command | DeadlineMissed | MissionEnd | FinalReport) -> str:
-    whose = "" if isinstance(message, MissionEnd) else f" of {message.robot}"
-    tick = "" if isinstance(message, FinalReport) else f" of tick {message.tick}"
-    return f"a {type(message).__name__}{whose}{tick} is out of order"

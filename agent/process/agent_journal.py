@@ -8,7 +8,7 @@ from typing import Any
 import msgspec
 
 from protocol import motion
-from protocol.journal.journal_file import CorruptJournal, UnexpectedFrame, take_all
+from protocol.journal.journal_file import CorruptJournal, JournalReading, UnexpectedFrame, take_all
 from protocol.messages import (
     Command,
     DeadlineMissed,
@@ -23,7 +23,7 @@ from protocol.messages import (
     RobotConfig,
 )
 from protocol.motion import ORIGIN, REST, Pose, compose, inverse
-from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
+from protocol.wire import MalformedFrame
 
 
 class FramedReport(msgspec.Struct, frozen=True):
@@ -110,47 +110,23 @@ class AgentHistory(msgspec.Struct, frozen=True):
         return tuple([compose(frame, pose) for pose in odometry])
 
 
-class AgentJournalReading:
-    """A reader of an agent's journal, frame by frame."""
+class AgentJournalReading(JournalReading):
+    """A reader of an agent's journal."""
+
+    KINDS = OfRobot
 
     def __init__(self, shared: dict[bytes, Any] | None = None) -> None:
-        """`shared` are the Reports and Commands that readers of the same recording have decoded, by frame."""
-        self._shared = {} if shared is None else shared
-        self.environment: Environment | None = None
+        """The `shared` messages are those of JournalReading."""
+        super().__init__(shared)
         self.config: RobotConfig | None = None
         """The configuration; None until it has been read."""
-        self.messages: list[Any] = []
-        """The messages that have been read, in order."""
-        self.unexpected: UnexpectedFrame | None = None
-        """The first frame out of order."""
         self._steps: list[Step] = []
         self._step: dict[str, Any] = {}
         """The fields of the latest step, to which frames can be added; empty before the first."""
         self._end: MissionEnd | None = None
         self._final_report: FinalReport | None = None
 
-    def take(self, frame: bytes) -> bool:
-        """Add the next frame, and return whether it is in order. Add no frame after one that is not.
-
-        Raises MalformedFrame, also if the first two frames are no environment and RobotConfig.
-        """
-        message = self._shared.get(frame)
-        if message is None:
-            message = decode(frame, OfRobot, MAX_FRAME_BYTES)
-            if isinstance(message, Report | Command):
-                self._shared[frame] = message
-        if not self._fits(message, frame):
-            tick: int | None = getattr(message, "tick", None)
-            at = f" of tick {tick}" if tick is not None else ""
-            kind = type(message).__name__
-            what = f"{'an' if kind[0] in 'AEIO' else 'a'} {kind}{at} is out of order"
-            self.unexpected = UnexpectedFrame(tick, what)
-            return False
-        self.messages.append(message)
-        return True
-
-    def _fits(self, message: object, frame: bytes) -> bool:
-        """Add `message`, and return True if it may be next."""
+    def _fits(self, message: Any, frame: bytes) -> bool:
         if self.config is None:
             return self._begins(message)
         step = self._step

@@ -20,6 +20,7 @@ import msgpack
 import msgspec
 
 from protocol.files import open_file
+from protocol.messages import Command, Environment, Report
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, is_sound, other_version, versions
 
 _packer = msgpack.Packer()
@@ -85,14 +86,55 @@ class Sink(Protocol):
         """Append all of `frames` in one operation."""
 
 
-class FrameReader(Protocol):
-    """The contract of a reader of a journal's frames."""
+class JournalReading:
+    """A reader of a journal, frame by frame. The journal may still be growing."""
+
+    KINDS: Any
+    """The kinds of messages in the journal."""
+
+    def __init__(self, shared: dict[bytes, Any] | None = None) -> None:
+        """`shared` are the Reports and Commands that readers of the same recording have decoded, by frame."""
+        self._shared = {} if shared is None else shared
+        self.environment: Environment | None = None
+        """The environment in which the journal was written; None until it has been read."""
+        self.messages: list[Any] = []
+        """The messages that have been read, in order."""
+        self.unexpected: UnexpectedFrame | None = None
+        """The first frame out of order."""
 
     def take(self, frame: bytes) -> bool:
-        """Add the next frame, and return whether it is in order. Raises MalformedFrame."""
+        """Add the next frame, and return whether it is in order. Add no frame after one that is not.
+
+        Raises MalformedFrame, also if the journal does not begin as it must.
+        """
+        message = self._shared.get(frame)
+        if message is None:
+            message = decode(frame, self.KINDS, MAX_FRAME_BYTES)
+            if isinstance(message, Report | Command):
+                self._shared[frame] = message
+        if not self._fits(message, frame):
+            self.unexpected = _out_of_order(message)
+            return False
+        self.messages.append(message)
+        return True
+
+    def _fits(self, message: Any, frame: bytes) -> bool:
+        """Add `message`, and return True if it may be next. Raises MalformedFrame."""
+        raise NotImplementedError
 
 
-def take_all(reading: FrameReader, frames: Iterable[bytes], source: object) -> CorruptJournal | None:
+def _out_of_order(message: Any) -> UnexpectedFrame:
+    kind, robot, tick = (
+        type(message).__name__,
+        getattr(message, "robot", None),
+        getattr(message, "tick", None),
+    )
+    whose, at = f" of {robot}" if robot is not None else "", f" of tick {tick}" if tick is not None else ""
+    article = "an" if kind[0] in "AEIO" else "a"
+    return UnexpectedFrame(tick, f"{article} {kind}{whose}{at} is out of order")
+
+
+def take_all(reading: JournalReading, frames: Iterable[bytes], source: object) -> CorruptJournal | None:
     """Give `frames` to `reading`, up to the first out of order; return the error of one that is damaged.
 
     The text of the error begins with `source`.
