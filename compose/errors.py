@@ -70,12 +70,14 @@ def within(where: str, kind: type[UserError]) -> Iterator[None]:
 
 
 @contextmanager
-def user_code(what: str) -> Iterator[None]:
+def user_code(what: str, exit_status: int = USER_ERROR) -> Iterator[None]:
     """Raise whatever code of the user raises in this context as a UserError that begins with `what`."""
     try:
         yield
-    except (Exception, SystemExit) as error:  # noqa: BLE001  # it may raise anything
-        raise UserError(f"{what} {type(error).__name__}: {error}") from None
+    except (Exception, SystemExit) as error:  # it may raise anything
+        failed = UserError(f"{what} {type(error).__name__}: {error}")
+        failed.exit_status = exit_status
+        raise failed from error
 
 
 # --- scenarios --------------------------------------------------------------------------------------

@@ -59,12 +59,8 @@ def _guarded(name: str, model: type) -> type:
 
     def guarded(method: str) -> Callable[..., Any]:
         def called(self: Any, *arguments: Any) -> Any:
-            try:
+            with user_code(f"the model {name}: {method}() raises", FAILED):
                 return getattr(super(subclass, self), method)(*arguments)
-            except (Exception, SystemExit) as error:
-                failed = UserError(f"the model {name}: {method}() raises {type(error).__name__}: {error}")
-                failed.exit_status = FAILED
-                raise failed from error
 
         return called
 
