@@ -13,7 +13,6 @@ import pytest
 import zenoh
 from msgspec.structs import replace
 
-from agent.process.link import WORLD_SILENCE_S
 from compose.launch.driver_loader import config_of
 from compose.recording.reasons import reason_for
 from compose.scenario.scenario_file import parse
@@ -33,6 +32,7 @@ from protocol.messages import (
 )
 from protocol.motion import ORIGIN, REST, Controls
 from protocol.network import keys
+from protocol.network.session import SILENCE_S
 from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
 from tests.stage import Stage
@@ -389,8 +389,8 @@ def test_an_agent_is_told_that_its_driver_waits_for_the_peer(stage: Stage) -> No
     with pytest.raises(NoStart):
         field.run_mission(10.0, lambda: None)
     assert {start for _, start in told} == {TickStart(0, "a")}
-    assert max(later - before for (before, _), (later, _) in pairwise(told)) < WORLD_SILENCE_S
-    assert stage.now - told[-1][0] < WORLD_SILENCE_S
+    assert max(later - before for (before, _), (later, _) in pairwise(told)) < SILENCE_S
+    assert stage.now - told[-1][0] < SILENCE_S
 
 
 # --- the clock ----------------------------------------------------------------------------------------

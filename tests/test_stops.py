@@ -12,7 +12,7 @@ from signal import SIGCONT, SIGSTOP
 
 import pytest
 
-from agent.process.link import AgentLink, WorldLinkLost
+from agent.process.link import AgentLink
 from compose.launch.processes import free_endpoint
 from compose.scenario.scenario_file import load
 from protocol.network import keys, session
@@ -30,7 +30,7 @@ from tests.commands import (
     tandem,
     until,
 )
-from world.process import RobotsLinkLost, WorldProcess
+from world.process import WorldProcess
 from world.simulation import Simulation
 
 NAMES = ("agent a", "agent b", "world")
@@ -217,7 +217,7 @@ def test_an_agent_s_session_that_receives_and_cannot_send_is_lost(monkeypatch: p
             while time.monotonic() < over:
                 link.next(over)
             unlinked.on = True
-            with pytest.raises(WorldLinkLost):
+            with pytest.raises(session.LinkLost):
                 until(lambda: link.next(time.monotonic() + 1.0).topic == "gone", "the session is lost")
 
 
@@ -231,7 +231,7 @@ def test_a_world_s_session_that_receives_and_cannot_send_is_lost(monkeypatch: py
         process.attach(client, replaceable=True)
         unlinked.on = True
         command = session.publisher(robot, keys.command("mute", "a"))
-        with repeating(lambda: command.put(b"again")), pytest.raises(RobotsLinkLost):
+        with repeating(lambda: command.put(b"again")), pytest.raises(session.LinkLost):
             process.run()
 
 

@@ -27,14 +27,13 @@ from protocol.spelling import did_you_mean
 from protocol.wire import encode
 from world.simulation import Simulation
 
-LINK_TIMEOUT_S = 3.0
-"""The time in s without a message after which a replaceable link is replaced. Agents do the same."""
 REPEAT_S = 0.25
 """The period in s in which an unanswered message is repeated."""
 REPEAT_TO_ALL_S = 1.0
 """The period in s in which messages are repeated to all robots while one has not answered.
 
-It is shorter than the time after which an agent replaces its link.
+In hardware mode, an agent is told as often that its driver waits for other robots. It is shorter than the
+time after which an agent replaces its link.
 """
 JOINING_S = 0.9
 """The time in s for which a RobotConfig is reserved for a process whose liveliness token is not there yet.
@@ -42,15 +41,14 @@ JOINING_S = 0.9
 An agent accepts a refusal that lasts a little longer.
 """
 FINAL_REPORT_TIMEOUT_S = 2.0
-"""The time in s to wait for the FinalReport of a robot that did not answer in the last tick."""
+"""The time in s to wait for the FinalReport of a robot that did not answer in the last tick.
+
+In hardware mode, drivers wait as long for that of their agent.
+"""
 
 
 class NoAnswer(TimeoutError):
     """Robots did not answer within the timeout. The text of the error names them."""
-
-
-class RobotsLinkLost(Exception):
-    """Nothing passes over this link in one direction. The robots may be reachable over another one."""
 
 
 class WorldProcess:
@@ -97,10 +95,6 @@ class WorldProcess:
         """The tick of the latest Command of each robot, in time or not."""
         self._truth_wanted = False
         """True while a viewer subscribes to GroundTruth."""
-        self._link_deadline = math.inf
-        """The time at which the link counts as lost if nothing is received until then."""
-        self._link_timeout = math.inf
-        """The time in s without a message after which the link counts as lost."""
         self._began: float | None = None
         """The time at which all robots had answered the first Observation."""
         self.running_s = 0.0
@@ -113,14 +107,12 @@ class WorldProcess:
     def attach(self, link: zenoh.Session, *, replaceable: bool = False) -> None:
         """Send and receive over the session `link` from now on.
 
-        If it is `replaceable`, `run` raises RobotsLinkLost after LINK_TIMEOUT_S and a tick without messages,
-        and if the session can only receive.
+        If it is `replaceable`, `run` raises LinkLost after SILENCE_S and a tick without messages, and if the
+        session can only receive.
         """
         self._processes.clear()  # it is not known which of them end before the next line
-        self._check = session.LinkCheck(link, self._inbox.clock()) if replaceable else None
         run, inbox = self._run, self._inbox
-        self._link_timeout = LINK_TIMEOUT_S + self._tick_s if replaceable else math.inf
-        self._link_deadline = self._inbox.clock() + self._link_timeout
+        self._check = session.LinkCheck(link, inbox, self._tick_s) if replaceable else None
         self._observation = {
             robot: session.publisher(link, keys.observation(run, robot)) for robot in self._robots
         }
@@ -134,7 +126,7 @@ class WorldProcess:
     def run(self) -> MissionEnd:
         """Run to the end of the mission, collect the FinalReports, and return the MissionEnd.
 
-        Raises RobotsLinkLost if the link is lost; `run` may then be called again with another session. Raises
+        Raises LinkLost if the link is lost; `run` may then be called again with another session. Raises
         Interrupted by a signal, and CannotRecord.
         """
         simulation = self._simulation
@@ -171,7 +163,7 @@ class WorldProcess:
     def _answers(self, observations: list[Observation], due: float | None) -> dict[str, Command]:
         """Return the Command of each robot; in real time, those received until `due`, the end of the tick.
 
-        Raises NoAnswer, RobotsLinkLost and Interrupted.
+        Raises NoAnswer, LinkLost and Interrupted.
         """
         tick = self._simulation.tick
         frames = {observation.robot: encode(observation) for observation in observations}
@@ -226,14 +218,7 @@ class WorldProcess:
             self._observation[robot].put(encode(observation))
 
     def _next(self, timeout: float) -> Arrival:
-        now = self._inbox.clock()
-        arrival = self._inbox.next(min(timeout, self._link_deadline - now))
-        if arrival is not NO_ARRIVAL:
-            self._link_deadline = now + self._link_timeout
-            if self._check is not None and self._check.is_mute(now):
-                raise RobotsLinkLost
-        elif self._inbox.clock() >= self._link_deadline:
-            raise RobotsLinkLost
+        arrival = (self._check or self._inbox).next(timeout)
         robot = arrival.source.robot
         if arrival.topic == "alive" and robot in self._robots:
             if robot not in self._alive:
@@ -355,10 +340,6 @@ class WorldProcess:
             now = self._inbox.clock()
 
 
-WORLD_POLL_S = 0.05
-"""The time in s between two attempts to reach a router."""
-
-
 class NoRouter(TimeoutError):
     """There is no router that the world, as a client, can connect to; the text says why."""
 
@@ -387,7 +368,7 @@ class WorldLinks:
             if self._inbox.clock() >= give_up:
                 why = diagnosis.why(self.endpoints)
                 raise NoRouter(f"no router at {self.endpoints}; gave up after {self._timeout:g} s: {why}")
-            self._inbox.next(WORLD_POLL_S)
+            self._inbox.next(session.ASK_AGAIN_S)
 
         if self.endpoints.connect:
             later = threading.Timer(diagnosis.FIRST_WORD_S, self._warn_without_link)
@@ -415,7 +396,7 @@ class WorldLinks:
         while True:
             try:
                 process.run()
-            except RobotsLinkLost:
+            except session.LinkLost:
                 self.open()
                 self.attach(process)
             else:

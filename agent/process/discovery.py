@@ -25,9 +25,6 @@ FORMER_S = 10.0
 It may need five seconds to end after its launcher was killed, and two to close its session. Its link has a
 lease of two seconds.
 """
-ASK_AGAIN_S = 0.05
-"""The seconds between two searches for a world."""
-
 REFUSED_S = 1.0
 """The seconds for which a refusal must persist, without a RobotConfig from any world, to be accepted."""
 MOST_WORLDS = 8
@@ -83,7 +80,7 @@ class Search:
 
     def pause(self) -> None:
         """Wait briefly while a world is visible. Raises Interrupted when the process is asked to stop."""
-        self._inbox.next(ASK_AGAIN_S)
+        self._inbox.next(session.ASK_AGAIN_S)
 
 
 class _Offers(NamedTuple):

@@ -9,18 +9,7 @@ import zenoh
 
 from protocol.messages import RobotConfig
 from protocol.network import keys, session
-from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
-
-WORLD_SILENCE_S = 3.0
-"""The seconds without a frame from the world after which a session is replaced.
-
-Zenoh itself drops a link after `session.LEASE_S` and reconnects, but occasionally nothing ever arrives over
-the reconnected link.
-"""
-
-
-class WorldLinkLost(Exception):
-    """Nothing passes over this session in one direction; the world may be reachable over a new one."""
+from protocol.network.inbox import Arrival, Inbox
 
 
 class AgentLink:
@@ -32,7 +21,7 @@ class AgentLink:
         """The robots whose Reports are received: the peer, or in a group or a team all robots."""
         self._run = run
         self._inbox = inbox
-        self._link_timeout = WORLD_SILENCE_S + (config.tick_s or 0.0)
+        self._tick_s = config.tick_s or 0.0
         self.estimate_wanted = False
         """True while any viewer subscribes to estimates."""
 
@@ -49,23 +38,14 @@ class AgentLink:
         session.watch_liveliness(link, keys.world_alive(run), self._inbox)
         self._show_alive = partial(session.show_alive, link, keys.robot_alive(run, me))
         self._token = self._show_alive()
-        self._check = session.LinkCheck(link, self._inbox.clock())
-        self._received_at = self._inbox.awake()
+        self._check = session.LinkCheck(link, self._inbox, self._tick_s, "observation")
 
     def next(self, until: float) -> Arrival:
         """Return the next arrival, or NO_ARRIVAL once the clock reaches `until`.
 
-        Raises WorldLinkLost if no Observation has arrived for too long, or if the session cannot send.
+        Raises LinkLost if no Observation has arrived for too long, or if the session cannot send.
         """
-        lost = self._received_at + self._link_timeout
-        arrival = self._inbox.next(min(until - self._inbox.clock(), lost - self._inbox.awake()))
-        if arrival.topic == "observation":
-            self._received_at = self._inbox.awake()
-            if self._check.is_mute(self._inbox.clock()):
-                raise WorldLinkLost
-        elif arrival is NO_ARRIVAL and self._inbox.awake() >= lost:
-            raise WorldLinkLost
-        return arrival
+        return self._check.next(until - self._inbox.clock())
 
     def appear(self) -> None:
         """Withdraw the liveliness token and declare it again, so that the world sees the robot reappear."""

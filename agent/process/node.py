@@ -18,8 +18,8 @@ from typing import Any
 import zenoh
 
 from agent.process.agent_journal import FramedReport
-from agent.process.discovery import ASK_AGAIN_S, NoWorld, Search, Unwelcome, confirm, join
-from agent.process.link import AgentLink, WorldLinkLost
+from agent.process.discovery import NoWorld, Search, Unwelcome, confirm, join
+from agent.process.link import AgentLink
 from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import OWN_REPORTS_KEPT, Memory
 from agent.process.report_bodies import malformed
@@ -110,7 +110,7 @@ class AgentProcess:
     def run(self) -> MissionEnd:
         """Run the mission over the attached link and return its MissionEnd.
 
-        Raises WorldLinkLost if nothing arrives over this link, NoWorld if the world is absent for too long,
+        Raises LinkLost if nothing arrives over this link, NoWorld if the world is absent for too long,
         and Interrupted when the process is asked to stop.
         """
         while self.end is None:
@@ -146,7 +146,7 @@ class AgentProcess:
         Raises NoWorld if the world is absent for too long, or Interrupted.
         """
         self._note_world(gone=True)
-        self._inbox.next(ASK_AGAIN_S)
+        self._inbox.next(session.ASK_AGAIN_S)
         self._check_timeout()
 
     def _note_world(self, *, gone: bool) -> None:
@@ -171,7 +171,7 @@ class AgentProcess:
 
         Meanwhile, repeat the stored answers when a repetition is due.
 
-        Raises WorldLinkLost if nothing arrives from the world for too long.
+        Raises LinkLost if nothing arrives from the world for too long.
         """
         if self._repeat_at is not None and self._inbox.clock() >= self._repeat_at:
             self._repeat_answers()
@@ -380,7 +380,7 @@ def run_agent(
                 found = process.run()
                 on_end()
                 return found
-        except WorldLinkLost:
+        except session.LinkLost:
             continue
         except Unwelcome:
             if end is None:

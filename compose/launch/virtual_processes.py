@@ -22,7 +22,6 @@ from typing import Any, NamedTuple, cast
 
 import zenoh
 
-from agent.process.link import WorldLinkLost
 from agent.process.node import AgentProcess
 from agent.process.recovery import Memory, remember
 from agent.process.robot import Robot
@@ -33,6 +32,7 @@ from protocol.journal.journal_file import Journal
 from protocol.journal.resume import Retrace
 from protocol.network.clock import Clock, ClockError
 from protocol.network.inbox import NO_ARRIVAL, SIGNAL_S, Arrival, Inbox
+from protocol.network.session import LinkLost
 from world.process import WorldProcess
 from world.scenario import Scenario
 from world.simulation import Simulation, resumed
@@ -418,7 +418,7 @@ def agent_process(network: VirtualNetwork, process: VirtualProcess) -> None:
             agent.attach(cast(Any, process.link))
             try:
                 agent.run()
-            except WorldLinkLost:
+            except LinkLost:
                 network.close(process.link, LATENCIES_S[0])
                 process.link = VirtualLink(network, process)
             else:

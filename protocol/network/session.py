@@ -21,7 +21,7 @@ from protocol import limits
 from protocol.messages import Message
 from protocol.network import keys
 from protocol.network.endpoints import Endpoints, zenoh_config
-from protocol.network.inbox import COMPLAINT, Arrival, Inbox, Line, LineClosed, Topic
+from protocol.network.inbox import COMPLAINT, NO_ARRIVAL, Arrival, Inbox, Line, LineClosed, Topic
 from protocol.network.keys import Key
 from protocol.wire import encode
 
@@ -29,6 +29,8 @@ CLOSE_TIMEOUT_S = 2.0
 """The time in s to wait for a session to close. Under loss it can take ten seconds."""
 LINK_CHECK_S = 1.0
 """The time in s between two checks whether a session that receives can also send."""
+ASK_AGAIN_S = 0.05
+"""The time in s between two attempts to reach a router, or to find a world."""
 LISTEN_AGAIN_S = 0.1
 """The time in s between two attempts to listen on a port."""
 
@@ -223,22 +225,56 @@ def linked(session: zenoh.Session) -> bool:
     return bool(session.info.routers_zid())
 
 
+class LinkLost(Exception):
+    """Nothing passes over a session in one direction; the other side may be reachable over a new one."""
+
+
+SILENCE_S = 3.0
+"""The time in s without a message after which a session is replaced.
+
+Zenoh itself drops a link after LEASE_S and reconnects, but occasionally nothing ever arrives over the
+reconnected link.
+"""
+
+
 class LinkCheck:
-    """Checks of a session that receives messages: it may have lost the ability to send.
+    """Checks of a session: it may have lost the ability to receive, or to send.
 
     A process that is stopped until Zenoh gives up its link connects again when it continues. Occasionally
     (in about one of a hundred such reconnections on a busy machine), its session then receives everything
     and sends nothing: its publishers match, its tokens are visible, but it lists no router.
     """
 
-    def __init__(self, session: zenoh.Session, now: float) -> None:
-        """Check `session` from `now` (s) on, unless it has no router from the start because it is one."""
-        self._session = session
+    def __init__(self, session: zenoh.Session, inbox: Inbox, tick_s: float, *topics: Topic) -> None:
+        """Check `session`, whose messages are put into `inbox`.
+
+        While nothing of the `topics`, or of any without them, arrives for SILENCE_S and a tick, it is lost.
+        Whether it can send is not checked if it has no router from the start because it is one.
+        """
+        self._session, self._inbox, self._topics = session, inbox, topics
+        self._silence = SILENCE_S + tick_s
+        self._received_at = inbox.awake()
         self._failed = 0 if linked(session) else None
         """The number of failed checks in sequence; None if the session is not checked."""
-        self._check_at = now + LINK_CHECK_S
+        self._check_at = inbox.clock() + LINK_CHECK_S
 
-    def is_mute(self, now: float) -> bool:
+    def next(self, timeout: float) -> Arrival:
+        """Return the next arrival, or NO_ARRIVAL after `timeout` s.
+
+        Raises LinkLost if there has been no message for too long, or if the session cannot send.
+        """
+        lost = self._received_at + self._silence
+        arrival = self._inbox.next(min(timeout, lost - self._inbox.awake()))
+        if arrival is NO_ARRIVAL:
+            if self._inbox.awake() >= lost:
+                raise LinkLost
+        elif not self._topics or arrival.topic in self._topics:
+            self._received_at = self._inbox.awake()
+            if self._is_mute(self._inbox.clock()):
+                raise LinkLost
+        return arrival
+
+    def _is_mute(self, now: float) -> bool:
         """Return whether the session cannot send, given that it has received a message at time `now`.
 
         A link that is just being replaced fails one check at most.

@@ -37,16 +37,9 @@ from world.hardware.driver_journal import DriverHistory
 from world.hardware.measurements import InvalidReading, mark_frames, observation_frame
 from world.hardware.termination import Ending
 from world.hardware.tick_source import UNHEARD, TickSource
+from world.process import FINAL_REPORT_TIMEOUT_S, REPEAT_S, REPEAT_TO_ALL_S
+from world.truth import limited_controls
 
-MISSION_END_REPEAT_S = 0.25
-"""The period in s in which the MissionEnd is repeated."""
-WAITING_S = 1.0
-"""The period in s in which the agent is told that its driver waits for other robots.
-
-It is shorter than the time after which an agent replaces its link.
-"""
-AGENT_FINAL_REPORT_S = 2.0
-"""The time in s to wait for the agent's FinalReport."""
 PUT_S = 2.0
 """The time in s that Zenoh has to take a frame at the end of a mission.
 
@@ -212,11 +205,11 @@ class Field:
         TickStart of a robot that now waits for this one may be lost: Zenoh loses what is sent just after two
         routers have connected, and this process may have been killed since. A robot therefore begins UNHEARD
         ticks after all are connected. One of a group begins at `give_up` without those that are missing, if
-        any other is there. Meanwhile its agent is told every WAITING_S that it waits.
+        any other is there. Meanwhile its agent is told every REPEAT_TO_ALL_S that it waits.
 
         Raises NoStart.
         """
-        waiting_s = min(WAITING_S, 0.25 * self._timeout)
+        waiting_s = min(REPEAT_TO_ALL_S, 0.25 * self._timeout)
         tell = self._inbox.clock() + waiting_s
         unheard = self._inbox.clock() + UNHEARD * self._tick_s
         while not self._may_begin():
@@ -308,13 +301,13 @@ class Field:
 
     def _drive(self, command: Command) -> None:
         """Execute `command`, limited to v_max and omega_max. Raises DriverFailed."""
-        mission = self._config.mission
-        v = min(max(command.v, -mission.max_speed), mission.max_speed)
-        omega = min(max(command.omega, -mission.max_turn_rate), mission.max_turn_rate)
+        controls = limited_controls(command, self._config.mission)
         try:
-            self._driver.drive(v, omega)
+            self._driver.drive(controls.v, controls.omega)
         except (Exception, SystemExit) as error:  # as above
-            raise DriverFailed(f"drive({v:g}, {omega:g}): {type(error).__name__}: {error}") from error
+            raise DriverFailed(
+                f"drive({controls.v:g}, {controls.omega:g}): {type(error).__name__}: {error}"
+            ) from error
 
     def _wait_for_command(self, tick: int) -> Command | None:
         """Return the Command of this tick; None if it arrives too late for a manoeuvre in the tick."""
@@ -425,12 +418,12 @@ class Field:
 
     def _finish(self, end: MissionEnd) -> None:
         """Send `end` to the agent until it sends its FinalReport, and acknowledge that."""
-        give_up = self._inbox.clock() + AGENT_FINAL_REPORT_S
+        give_up = self._inbox.clock() + FINAL_REPORT_TIMEOUT_S
         while (now := self._inbox.clock()) < give_up and self._id in self._alive:
             if not self._is_taken(encode(end)):
                 self._inbox.say(f"no FinalReport of {self._id}: Zenoh does not take the MissionEnd")
                 return
-            repeat = min(now + MISSION_END_REPEAT_S, give_up)
+            repeat = min(now + REPEAT_S, give_up)
             while (left := repeat - self._inbox.clock()) > 0.0:
                 arrival = self._inbox.next(left)
                 if arrival.topic == "gone":
