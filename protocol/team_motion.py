@@ -10,7 +10,7 @@ from collections.abc import Iterable
 from functools import lru_cache
 
 from protocol.messages import TeamAnchor
-from protocol.mission import Anchor, Mission
+from protocol.mission import Mission
 from protocol.motion import TAU, Controls
 from protocol.orbits import Orbit
 from protocol.sweep_strips import Place
@@ -59,7 +59,8 @@ def nearest_other(anchor: TeamAnchor, anchors: Iterable[TeamAnchor]) -> float | 
     places = [one.position for one in anchors if one.position is not None and one.id != anchor.id]
     if here is None:
         return None
-    return min([away for one in places if (away := _distance(here, one)) > 0.0], default=None)
+    distances = [math.hypot(here.x - one.x, here.y - one.y) for one in places]
+    return min([away for away in distances if away > 0.0], default=None)
 
 
 def way_past(mission: Mission, distance: float) -> Orbit:
@@ -112,7 +113,3 @@ def search_ticks(mission: Mission, robots: int, diameter: float) -> int:
 
 MEASURING_LOOPS = 3
 """The number of loops in which a robot measures enough ranges for a claim."""
-
-
-def _distance(one: Anchor, other: Anchor) -> float:
-    return math.hypot(one.x - other.x, one.y - other.y)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from typing import Any
 
 from world.range_models import crosses, walls_of
-from world.world_models import Point, RadioModel, Transmission
+from world.world_models import RadioModel, Transmission
 
 
 class FadingRadio(RadioModel[None]):
@@ -115,7 +115,7 @@ class CollidingRadio(RadioModel[None]):
         radios, reach = transmission.radios, self.interference * transmission.reach
         own = self._slot(transmission, transmission.sender)
         for robot, place in transmission.senders:
-            near = _distance(place, radios.other) <= reach
+            near = math.dist(place, radios.other) <= reach
             if robot != transmission.sender and near and self._slot(transmission, robot) == own:
                 return state, None
         return state, 0
@@ -123,10 +123,6 @@ class CollidingRadio(RadioModel[None]):
     def _slot(self, transmission: Transmission, robot: str) -> int:
         """Return the slot of a robot, which all links of the tick agree on."""
         return int(transmission.radios._replace(name=robot).uniform("slot") * self.slots)
-
-
-def _distance(one: Point, other: Point) -> float:
-    return math.hypot(one[0] - other[0], one[1] - other[1])
 
 
 RADIO_MODELS: dict[str, type[RadioModel[Any]]] = {

@@ -57,7 +57,7 @@ class Radios(NamedTuple):
     @property
     def distance(self) -> float:
         """The distance between the two, in m."""
-        return math.hypot(self.one[0] - self.other[0], self.one[1] - self.other[1])
+        return math.dist(self.one, self.other)
 
     def uniform(self, what: str) -> float:
         """Return a random number in (0, 1), of its own for each tick and each word `what`."""
