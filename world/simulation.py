@@ -145,11 +145,5 @@ def _retrace(simulation: Simulation, recording: Retrace) -> None:
             simulation.end(recorded.end)
         simulation.journal_final_reports(recorded.final_reports.values())
     except ReplayMismatch:
-        raise CorruptJournal(
-            f"{recording.path}: the recorded world differs from the recomputed one at tick "
-            f"{simulation.tick}: "
-            + (
-                environment.otherwise(recorded.environment, environment.of_world())
-                or "the journal is another version's"
-            )
-        ) from None
+        what = f"world differs from the recomputed one at tick {simulation.tick}"
+        raise recording.differing(what, recorded.environment, environment.of_world()) from None

@@ -15,7 +15,6 @@ from agent.planning.planner import Planner
 from agent.process.agent_journal import FramedReport, agent_history
 from agent.process.robot import REPORTS_KEPT, PlannerReplay, Robot
 from protocol.journal import environment
-from protocol.journal.journal_file import CorruptJournal
 from protocol.journal.resume import ReplayMismatch, Retrace
 from protocol.messages import FinalReport, MissionEnd, Observation, RobotConfig
 from protocol.wire import encode
@@ -64,13 +63,8 @@ def remember(recording: Retrace, planner_of: Callable[[RobotConfig], Planner[Any
             if step.command is not None:
                 robot.estimate()
     except ReplayMismatch:
-        raise CorruptJournal(
-            f"{recording.path}: the recorded decision differs at tick {replay.tick}: "
-            + (
-                environment.otherwise(journal.environment, environment.of_robot())
-                or "the journal was written by another version"
-            )
-        ) from None
+        what = f"decision differs at tick {replay.tick}"
+        raise recording.differing(what, journal.environment, environment.of_robot()) from None
     if journal.final_report is not None:  # it also counts received frames, which a replay cannot reproduce
         recording.write(*recording.frames[-2:])
     observation = journal.steps[-1].observation if journal.steps else None

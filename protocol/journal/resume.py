@@ -11,7 +11,9 @@ import os
 from pathlib import Path
 
 from protocol.files import open_regular
-from protocol.journal.journal_file import CannotRecord, Journal, lock, packed, torn
+from protocol.journal.environment import otherwise
+from protocol.journal.journal_file import CannotRecord, CorruptJournal, Journal, lock, packed, torn
+from protocol.messages import Environment
 
 
 class ReplayMismatch(ValueError):
@@ -44,6 +46,11 @@ class Retrace:
         except BaseException:
             self.close()
             raise
+
+    def differing(self, what: str, recorded: Environment, here: Environment) -> CorruptJournal:
+        """Return the error of a replay: the recorded `what`, such as "world differs at tick 3", and why."""
+        why = otherwise(recorded, here) or "the journal was written by another version"
+        return CorruptJournal(f"{self.path}: the recorded {what}: {why}")
 
     def write(self, *frames: bytes) -> None:
         """Compare `frames` with the next recorded ones.
