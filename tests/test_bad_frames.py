@@ -185,8 +185,8 @@ def test_invalid_frames_before_the_first_tick_are_refused_counted_and_reported_o
         refused_on(TRUSTED["command"], clock, nonsense[TRUSTED["command"]])
         for topic in ("observation", "report"):
             refused_on(TRUSTED[topic], agents[0], nonsense[TRUSTED[topic]])
-        assert complaints(clock, GHOST) == ["its sender is given as 'ghost'"]
-        assert complaints(clock, OTHER) == ["its sender is given as 'a'"]
+        assert complaints(clock, GHOST) == ["its robot is given as 'ghost'"]
+        assert complaints(clock, OTHER) == ["its robot is given as 'a'"]
         assert not any("Traceback" in command.err for command in (clock, *agents))
 
     assert tandem("run", scenario, "--in-process", "-q", "--out", alone).status == 0

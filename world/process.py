@@ -236,7 +236,7 @@ class WorldProcess:
         """Return the message that arrived, if it is a `kind` from the robot of its key; None if refused."""
         message: Command | FinalReport | None = self._inbox.accepted(arrival, kind)
         if message is not None and message.robot not in self._peers:
-            self._inbox.refuse(arrival, f"its sender is given as '{message.robot}'")
+            self._inbox.refuse(arrival, f"its robot is given as '{message.robot}'")
             return None
         return message
 

@@ -13,7 +13,6 @@ import math
 from collections import deque
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import zenoh
 
@@ -29,8 +28,10 @@ from protocol.messages import MissionEnd, Observation, RobotConfig, TickStart
 from protocol.network import session
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Arrival, Inbox
-from protocol.wire import MalformedFrame, decode, encode
+from protocol.wire import encode
 
+FROM_WORLD = Observation | MissionEnd | TickStart
+"""The messages that an agent receives from the world. A TickStart is of a tick that cannot begin yet."""
 REPORT_SHARE = 0.5
 """The fraction of a tick to wait for the peer's report, in real time."""
 FIELD_SHARE = 0.1
@@ -69,7 +70,7 @@ class AgentProcess:
         within a tick and the tick, so that a scheduled kill can happen there.
         """
         config = memory.config
-        self._id, self._others = config.robot, {*config.others}
+        self._others = {*config.others}
         self._inbox = inbox
         self._timeout = timeout
         self._tick_s = config.tick_s
@@ -87,7 +88,7 @@ class AgentProcess:
             self._set_due()
         real_time = self._tick_s is not None
         self._link = AgentLink(config, run, inbox)
-        self._out_of_step = OutOfStep(self._id, inbox, self._link.appear, real_time=real_time)
+        self._out_of_step = OutOfStep(config.robot, inbox, self._link.appear, real_time=real_time)
         self._report_buffer = ReportBuffer(
             inbox,
             memory.received,
@@ -117,7 +118,7 @@ class AgentProcess:
             arrival = self._next(self._due)
             match arrival.topic:
                 case "observation":
-                    message = self._decoded(arrival)
+                    message = self._inbox.accepted(arrival, FROM_WORLD)
                     if isinstance(message, MissionEnd) and (
                         message.tick == self._latest_tick or self._out_of_step.persists(message, ENDED_S)
                     ):
@@ -192,19 +193,6 @@ class AgentProcess:
         return self._observation.tick if self._observation is not None else -1
 
     # --- arrivals ---
-
-    def _decoded(self, arrival: Arrival) -> Observation | MissionEnd | TickStart | None:
-        """Return the message; None if it is refused. A TickStart is of a tick that cannot begin yet."""
-        try:
-            message: Any = decode(arrival.frame, Observation | MissionEnd | TickStart)
-        except MalformedFrame as error:
-            self._inbox.refuse(arrival, error)
-            return None
-        if not isinstance(message, MissionEnd) and message.robot != self._id:
-            self._inbox.refuse(arrival, f"it is addressed to '{message.robot}'")
-            return None
-        decoded: Observation | MissionEnd | TickStart = message
-        return decoded
 
     def _on_observation(self, observation: Observation, frame: bytes) -> bool:
         """Process an Observation and return whether it is in step. Raises NoWorld."""
@@ -319,7 +307,7 @@ class AgentProcess:
             if arrival.topic == "observation":
                 if arrival.frame == frame:
                     break
-                message = self._decoded(arrival)
+                message = self._inbox.accepted(arrival, FROM_WORLD)
                 if isinstance(message, Observation):
                     self._out_of_step.observation(message, end.tick)
                 elif isinstance(message, MissionEnd):

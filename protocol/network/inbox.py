@@ -202,15 +202,16 @@ class Inbox:
                 return NO_ARRIVAL
 
     def accepted(self, arrival: Arrival, kind: Any, limit: int = MAX_SENT_BYTES) -> Any:
-        """Return the message in `arrival` if it is a `kind` from the robot of its key; None if refused."""
+        """Return the message in `arrival` if it is a `kind` of the robot of its key; None if refused."""
         try:
             message = decode(arrival.frame, kind, limit)
         except MalformedFrame as error:
             self.refuse(arrival, error)
             return None
-        if message.robot == arrival.source.robot:
+        named = getattr(message, "robot", arrival.source.robot)  # a MissionEnd names none
+        if named == arrival.source.robot:
             return message
-        self.refuse(arrival, f"its sender is given as '{message.robot}'")
+        self.refuse(arrival, f"its robot is given as '{named}'")
         return None
 
     def refuse(self, arrival: Arrival, why: object) -> None:
