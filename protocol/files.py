@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import glob
 import os
 import stat
 from collections.abc import Iterator
@@ -41,10 +42,20 @@ def open_file(path: Path) -> BinaryIO:
 
 def open_regular(path: Path, flags: int) -> int:
     """Return a descriptor of the regular file at `path`. Raises like `open_file`."""
-    if not stat.S_ISREG(mode := path.stat().st_mode):  # opening some devices has an effect
+    return _opened(path, flags | os.O_NONBLOCK, path)
+
+
+def _opened(name: str | Path, flags: int, path: Path, folder: int | None = None) -> int:
+    """Return a descriptor of the regular file, or with O_DIRECTORY of the directory, `name`.
+
+    In a `folder`, it must not be a link. NotRegular names `path`.
+    """
+    wanted = stat.S_ISDIR if flags & os.O_DIRECTORY else stat.S_ISREG
+    before = os.stat(name, dir_fd=folder, follow_symlinks=folder is None)
+    if not wanted(mode := before.st_mode):  # opening some devices has an effect
         raise NotRegular(path, mode)
-    file = os.open(path, flags | os.O_NONBLOCK | os.O_CLOEXEC)
-    if not stat.S_ISREG(mode := os.fstat(file).st_mode):  # it has been replaced since `stat`
+    file = os.open(name, flags | os.O_CLOEXEC, dir_fd=folder)
+    if not wanted(mode := os.fstat(file).st_mode):  # it has been replaced since `stat`
         os.close(file)
         raise NotRegular(path, mode)
     return file
@@ -91,18 +102,11 @@ def regular_in(folder: Path, pattern: str) -> list[str]:
 
 def _within(folder: int, name: str, flags: int, path: Path) -> int:
     """Return a descriptor of the directory (O_DIRECTORY) or file `name` in `folder`; errors name `path`."""
-    wanted = stat.S_ISDIR if flags & os.O_DIRECTORY else stat.S_ISREG
     try:
-        if not wanted(mode := os.stat(name, dir_fd=folder, follow_symlinks=False).st_mode):
-            raise NotRegular(path, mode)
-        descriptor = os.open(name, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | flags, dir_fd=folder)
+        return _opened(name, os.O_RDONLY | os.O_NOFOLLOW | flags, path, folder)
     except OSError as error:
         error.filename = str(path)
         raise
-    if not wanted(mode := os.fstat(descriptor).st_mode):  # it has been replaced since `stat`
-        os.close(descriptor)
-        raise NotRegular(path, mode)
-    return descriptor
 
 
 def _content(file: BinaryIO, path: Path, most: int) -> bytes:
@@ -136,11 +140,11 @@ def draft(path: Path, mode: int = 0o666) -> Iterator[Path]:
     try:
         place, file = _new(path, 0, mode)
     except FileExistsError:  # a process was killed, or writes the same file now
-        for left in path.parent.glob(f".{_literal(path.name)}.*{DRAFT}"):
+        for left in path.parent.glob(f".{glob.escape(path.name)}.*{DRAFT}"):
             _remove_abandoned(left)
         place, file = _new(path, os.getpid(), mode)
     try:
-        _lock(file)
+        lock(file)
         yield place
         place.replace(path)
     except OSError as error:
@@ -157,23 +161,18 @@ def _new(path: Path, owner: int, mode: int) -> tuple[Path, int]:
     return place, os.open(place, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
 
 
-def _literal(name: str) -> str:
-    """Return a glob pattern that matches only `name`."""
-    return "".join([f"[{one}]" if one in "*?[" else one for one in name])
-
-
 def _remove_abandoned(path: Path) -> None:
     """Remove the draft at `path` unless a process is writing it."""
     with suppress(OSError):
         file = open_regular(path, os.O_RDONLY)
         try:
-            _lock(file)
+            lock(file)
             path.unlink()
         finally:
             os.close(file)
 
 
-def _lock(file: int) -> None:
+def lock(file: int) -> None:
     """Lock `file` exclusively. Raises BlockingIOError if another process has the lock."""
     try:
         fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -9,17 +9,15 @@ processes never write the same journal.
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Protocol
 
 import msgpack
 import msgspec
 
-from protocol.files import open_file
+from protocol import files
 from protocol.messages import Command, Environment, Report
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode, is_sound, other_version, versions
 
@@ -210,9 +208,7 @@ class Journal:
     def __enter__(self) -> Journal:
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 
@@ -231,12 +227,10 @@ def lock(file: int, path: Path) -> None:
     If another process has the lock, close `file` and raise CannotRecord.
     """
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        files.lock(file)
     except BlockingIOError:
         os.close(file)
         raise CannotRecord(f"{path} is in use by another process; choose another folder") from None
-    except OSError:  # a file system without locks
-        pass
 
 
 def packed(frames: Iterable[bytes]) -> bytes:
@@ -321,7 +315,7 @@ class Tail:
         if its first frame has another version.
         """
         piece = JOURNAL_PIECE_BYTES if most is None else most
-        with open_file(self.path) as file:
+        with files.open_file(self.path) as file:
             file.seek(self.whole)
             data = file.read(piece)
         self.more = False
