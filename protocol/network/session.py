@@ -151,12 +151,15 @@ def deliver(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> None:
 
 
 def _arrival(sample: zenoh.Sample, inbox: Inbox, topic: Topic) -> Arrival | None:
-    """Return the message, or None if `inbox` refuses it: a deletion, or on a wildcard or unknown key."""
+    """Return the message, or None if `inbox` refuses it: a deletion, or on a wildcard or unknown key.
+
+    A liveliness token that disappears, of the topic "gone", is a deletion for Zenoh.
+    """
     key = str(sample.key_expr)
     source = keys.parse(key)
     if source is None:
         inbox.turn_away(topic, key, NO_KEY)
-    elif sample.kind == zenoh.SampleKind.DELETE:
+    elif sample.kind == zenoh.SampleKind.DELETE and topic != "gone":
         inbox.turn_away(topic, key, "a deletion")
     else:
         return Arrival(topic, key, sample.payload.to_bytes(), source)
@@ -202,13 +205,7 @@ def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
     """Put "alive" or "gone" into `inbox` for each token on `key`, including those that exist already."""
 
     def hand_over(sample: zenoh.Sample) -> None:
-        topic: Topic = "alive" if sample.kind == zenoh.SampleKind.PUT else "gone"
-        shown = str(sample.key_expr)
-        source = keys.parse(shown)
-        if source is None:
-            inbox.turn_away(topic, shown, NO_KEY)
-        else:
-            inbox.put(topic, shown, source=source)
+        deliver(sample, inbox, "alive" if sample.kind == zenoh.SampleKind.PUT else "gone")
 
     session.liveliness().declare_subscriber(key, _at_once(hand_over), history=True)
 
