@@ -480,6 +480,7 @@ def test_the_page_shows_how_localisation_spreads(opened: Open, folder: Path) -> 
         expect(page.locator("#caption")).to_have_text(
             "r0 drives to r5 and r3 drives to r7, which wait beside their anchors."
         )
+        expect(page.locator("#robots .name")).to_have_text(["r0", "r5"])  # of those that are told of
         for text, role in (("r0 to r5", "a"), ("r4 waiting", "b")):
             entry = page.locator("#roster .entry", has_text=text)
             expect(entry).to_have_attribute("data-role", role)

@@ -19,7 +19,7 @@ from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Observation
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
-from tests.browser import Open, inks, picture, scrub_to, shot, until_shown, watching
+from tests.browser import Open, inks, picture, scrub_to, shot, stop_clock, until_shown, watching
 from tests.commands import ENDLESS, TandemProcess, until, world
 from tests.series import series
 from world.referee import errors
@@ -191,6 +191,52 @@ def test_a_hypothesis_that_goes_on_moves_to_where_it_is_next_and_others_as_drive
     assert page.evaluate(HELD, [now, far, 0.5])["poses"][0] == [0.5, 0, 0]  # it jumps at the tick
 
 
+CROWDED = """async () => {
+  const { Labels, NAME } = await import('/page/labels.js');
+  const look = { font: '12px sans-serif', bold: '600 15px sans-serif', paper: '#fff' };
+  const labels = new Labels(document.createElement('canvas').getContext('2d'), look, 400, 300, []);
+  for (let y = 0; y <= 300; y += 6) labels.avoid([0, y], [400, y]);
+  labels.put('2.00 m', 200, 150, '#000', 'center');
+  labels.put('a', 200, 150, '#000', 'left', { rank: NAME, around: 15 });
+  labels.draw();
+  return labels.drawn.map(({ text }) => text);
+}"""
+
+
+def test_among_many_ranges_a_robot_keeps_its_name(opened: Open, address: str) -> None:
+    assert opened(address).evaluate(CROWDED) == ["a"]
+
+
+WATCHED = """() => {
+  window.changes = [];
+  new MutationObserver((records) => {
+    for (const { target, attributeName } of records) {
+      window.changes.push(`${target.id || target.className}.${attributeName}`);
+    }
+  }).observe(document, { subtree: true, childList: true, attributes: true, characterData: true });
+}"""
+
+
+def test_a_frame_within_a_tick_changes_no_element(opened: Open, address: str) -> None:
+    """If one did, the browser would compute styles and the layout in each frame."""
+    page = opened(address)
+    scrub_to(page, 20)
+    page.locator("#speed").select_option("0.5")
+    stop_clock(page)
+    page.keyboard.press("Space")
+    page.clock.run_for(200)
+    before = picture_of(page)
+    page.evaluate(WATCHED)
+    page.clock.run_for(400)
+    assert picture_of(page) != before
+    assert page.evaluate("window.changes") == []
+
+
+def picture_of(page: Page) -> str:
+    """Return the canvas as it is, whose clock stands."""
+    return str(page.evaluate("document.getElementById('canvas').toDataURL()"))
+
+
 @pytest.mark.long
 def test_a_view_is_the_same_picture_however_it_was_reached(opened: Open, address: str) -> None:
     """A part that does not change between two ticks is drawn once, and again when it changes."""
@@ -218,7 +264,7 @@ JOINED = """async () => {
   const player = (robot) => ({ robot, command: { phase: 2 }, contacts: [], down: false });
   const robots = [{ id: 'a', role: 'a', peer: 'b' }];
   const store = {
-    stage: { robots }, whole: 1, last: 0, live: true,
+    stage: { robots }, few: () => robots, whole: 1, last: 0, live: true,
     scene: () => ({ players: [player('a'), player('b')], events: [] }),
   };
   timeline.stage(store);

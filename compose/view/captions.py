@@ -325,7 +325,7 @@ def locating(team: PairData) -> Told:
         poses = [
             f"{count_word(count)}{what if i == 0 else ''} of {one}" for i, (one, count) in enumerate(new)
         ]
-        text = f"The distances leave {listed(poses, 'robots a few hypotheses')}."
+        text = f"At first, the distances leave {listed(poses, 'robots a few hypotheses')}."
         yield Caption("configurations", text, tuple([robot for robot, _ in new]))
     if left:
         yield Caption("ruled-out", f"One hypothesis of {listed(left)} is left.", tuple(left))

@@ -3,9 +3,8 @@
 
 import { TAU } from "./geometry.js";
 import { draw_tree } from "./group.js";
-import { DASHED } from "./pen.js";
+import { DASHED, line, stroked } from "./pen.js";
 import { rounded_up } from "./strip.js";
-import { kinds_of } from "./trails.js";
 import { metres } from "./words.js";
 
 const FEW = 4; // anchors of a team whose ranges are drawn in full colours
@@ -34,7 +33,7 @@ export class Backdrop {
       if (store.grouped && truth) draw_tree(this.pen, plane, view);
       for (const robot of robots) if (robot.anchor) this.#anchor(view, robot);
       for (const one of this.#shared(view)) this.#anchor(view, one);
-      if (truth) for (const robot of robots) for (const kind of kinds_of(robot)) this.trails.trail(this.pen, view, robot, kind);
+      if (truth) this.trails.trails(this.pen, view, robots);
       this.paths = [...plane.marks]; // the trails have named them
     }
     plane.context.save();
@@ -60,8 +59,6 @@ export class Backdrop {
   #grid(look) {
     const { pen, plane } = this, { width, height, scale, centre } = plane;
     const unit = rounded_up(Math.min(80, width / 9) / scale);
-    pen.strokeStyle = look.grid;
-    pen.lineWidth = 1;
     pen.beginPath();
     const left = centre[0] - width / 2 / scale, right = left + width / scale;
     const low = centre[1] - height / 2 / scale, high = low + height / scale;
@@ -73,13 +70,10 @@ export class Backdrop {
       const py = Math.round(plane.at([0, y])[1]) + 0.5;
       pen.moveTo(0, py); pen.lineTo(width, py);
     }
-    pen.stroke();
+    stroked(pen, look.grid, 1);
     const bar = unit * scale, x = width - 14, y = height - 14;
-    pen.strokeStyle = pen.fillStyle = look.faint;
-    pen.lineWidth = 2;
-    pen.beginPath();
-    pen.moveTo(x - bar, y - 4); pen.lineTo(x - bar, y); pen.lineTo(x, y); pen.lineTo(x, y - 4);
-    pen.stroke();
+    line(pen, [[x - bar, y - 4], [x - bar, y], [x, y], [x, y - 4]], look.faint, 2);
+    pen.fillStyle = look.faint;
     pen.textAlign = "right";
     pen.fillText(unit >= 1 ? `${unit} m` : metres(unit), x - 5, y - 5);
     this.bar = [x - Math.max(bar, 60), y - 18, x, y + 4];
@@ -88,23 +82,18 @@ export class Backdrop {
   /** Draws the range of an anchor, and its robot's orbit or, in a team, three sigmas of its position. */
   #anchor(view, robot) {
     const { pen, plane } = this, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
-    if (view.store.estimated) return;
+    const [mx, my] = robot.anchor, far = Math.max(reach / plane.scale, robot.orbit?.[0] ?? 0);
+    if (view.store.estimated || (robot.orbit && !plane.sees([mx - far, my - far], [mx + far, my + far]))) return;
     pen.globalAlpha = alpha * Math.min(1, FEW / view.store.stage.anchors.length);
     pen.beginPath();
     pen.arc(x, y, reach, 0, TAU);
     pen.fillStyle = look.disc;
     pen.fill();
     const localised = view.store.grouped && robot.role === "a";
-    pen.lineWidth = localised ? 2.2 : 1.2;
-    pen.strokeStyle = localised ? look.robot.a : look.ring;
-    pen.stroke();
+    stroked(pen, localised ? look.robot.a : look.ring, localised ? 2.2 : 1.2);
     pen.beginPath();
     pen.arc(...(robot.told ? plane.at(robot.told) : [x, y]), (robot.orbit?.[0] ?? 3 * robot.sigma) * plane.scale, 0, TAU);
-    pen.setLineDash(DASHED);
-    pen.lineWidth = 1;
-    pen.strokeStyle = look.orbit;
-    pen.stroke();
-    pen.setLineDash([]);
+    stroked(pen, look.orbit, 1, DASHED);
     pen.globalAlpha = 1;
   }
 
@@ -119,17 +108,11 @@ export class Backdrop {
     pen.globalAlpha = alpha;
     pen.beginPath();
     pen.moveTo(x, y - r); pen.lineTo(x + r, y + r * 0.75); pen.lineTo(x - r, y + r * 0.75); pen.closePath();
-    pen.lineWidth = 2.5;
-    pen.strokeStyle = view.look.paper;
-    pen.stroke();
+    stroked(pen, view.look.paper, 2.5);
     const hollow = robot.told === null;
     pen.fillStyle = hollow ? view.look.paper : view.look.ink;
     pen.fill();
-    if (hollow) {
-      pen.lineWidth = 1.4;
-      pen.strokeStyle = view.look.ink;
-      pen.stroke();
-    }
+    if (hollow) stroked(pen, view.look.ink, 1.4);
     pen.globalAlpha = 1;
   }
 

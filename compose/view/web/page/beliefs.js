@@ -4,7 +4,7 @@ import { shown } from "./configurations.js";
 import { between, compose, distance, ellipse, frame_of, step, TAU } from "./geometry.js";
 import { held_now, lacks_bearing } from "./held.js";
 import { NAME } from "./labels.js";
-import { circle, cross, DOTTED, fading, OUTLINED, outlined, shape } from "./pen.js";
+import { circle, cross, dot, DOTTED, fading, OUTLINED, outlined, shape, stroked } from "./pen.js";
 import { metres, probability } from "./words.js";
 
 const FADING = 3;
@@ -23,7 +23,7 @@ export class Beliefs {
     const tints = this.plane.tints.of(store, tick, robot.id);
     if (!poses.length) return this.#somewhere(view, robot, player);
     this.#ruled_out(view, robot);
-    if (!held.world.length && !truth) this.#any_bearing(view, robot, poses[0]);
+    if (!held.world.length && !truth) this.#around(look, robot, distance(poses[0], robot.anchor), 0.5, 2, "bearing unknown");
     // At the true bearing, which the robot does not know, the outline of its only pose would say that it does.
     const bearing_unknown = truth && lacks_bearing(held);
     if (!bearing_unknown) this.plane.marks.add(tints.length ? "configuration" : "pose");
@@ -44,7 +44,7 @@ export class Beliefs {
       }
       if (!truth || (tints.length && size > 6)) labels.placed.push([x - size, y - size, x + size, y + size]);
       const colour = tints.length ? look.tint(tints[place]) : look.ghost;
-      outlined(pen, robot.role, [x, y], pose[2], grown, colour, tints.length ? 2.6 : 2, held.world.length || !truth || size <= 6 ? [] : OUTLINED);
+      outlined(pen, robot.role, [x, y], pose[2], grown, colour, tints.length ? 2.6 : 2);
       const many = held.probability.length > 1 && chance > 0.01;
       const parts = [...(tints.length > 1 ? [String(tints[place] + 1)] : []), ...(many ? [probability(chance)] : [])];
       if (parts.length && place < 6 && size > 6) {
@@ -71,10 +71,7 @@ export class Beliefs {
       pen.beginPath();
       pen.arc(x, y, Math.max(radius, 3), 0, TAU);
       this.#cloud(look);
-      pen.beginPath();
-      pen.arc(x, y, 2.5, 0, TAU);
-      pen.fillStyle = look.ghost;
-      pen.fill();
+      dot(pen, [x, y], 2.5, look.ghost);
       if (truth) continue; // it has a name where it stands
       const text = `${id} ± ${metres(sigma)}`, away = Math.max(radius, 5), side = away + 4 + pen.measureText(text).width / 2;
       labels.put(text, x, y + away + 13, look.ink, "center", { others: [[x, y - away - 5], [x + side, y + 4], [x - side, y + 4]] });
@@ -105,23 +102,18 @@ export class Beliefs {
   /** Draws the circle on which the robot is, or its anchor's sensing range, before it has a pose. */
   #somewhere({ look, truth, store, moving, share }, robot, player) {
     if (!player || !robot.anchor || (truth && player.anchor_range === undefined)) return;
-    this.plane.marks.add("places");
-    const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
     const range = player.anchor_range ?? store.stage.mission.sensing_range;
-    pen.globalAlpha = truth ? fading(share, moving) : 1; // the true robot leaves the circle
-    circle(this.plane, robot.anchor, range, look.ghost, 3, DOTTED);
-    pen.globalAlpha = 1;
-    if (!truth) this.plane.labels.put(`${robot.id}: position unknown`, x, y - range * this.plane.scale - 6, look.ghost, "center");
+    this.#around(look, robot, range, truth ? fading(share, moving) : 1, 3, truth ? "" : "position unknown"); // the true robot leaves the circle
   }
 
-  /** Draws the circle of possible positions of a robot whose bearing from its anchor is unknown. */
-  #any_bearing({ look }, robot, pose) {
+  /** Draws the circle of possible positions of a robot at a distance of its anchor. */
+  #around(look, robot, radius, alpha, width, unknown) {
     this.plane.marks.add("places");
-    const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor), radius = distance(pose, robot.anchor);
-    pen.globalAlpha = 0.5;
-    circle(this.plane, robot.anchor, radius, look.ghost, 2, DOTTED);
+    const pen = this.plane.context, [x, y] = this.plane.at(robot.anchor);
+    pen.globalAlpha = alpha;
+    circle(this.plane, robot.anchor, radius, look.ghost, width, DOTTED);
     pen.globalAlpha = 1;
-    this.plane.labels.put(`${robot.id}: bearing unknown`, x, y - radius * this.plane.scale - 6, look.ghost, "center");
+    if (unknown) this.plane.labels.put(`${robot.id}: ${unknown}`, x, y - radius * this.plane.scale - 6, look.ghost, "center");
   }
 
   /** Draws the poses ruled out in the last FADING ticks, propagated by odometry to the current tick. */
@@ -180,8 +172,6 @@ export class Beliefs {
     const pen = this.plane.context;
     pen.fillStyle = look.cloud;
     pen.fill();
-    pen.lineWidth = 1.5;
-    pen.strokeStyle = look.ghost;
-    pen.stroke();
+    stroked(pen, look.ghost, 1.5);
   }
 }

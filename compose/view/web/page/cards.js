@@ -26,7 +26,7 @@ export class Cards {
     this.roster.replaceChildren();
     this.roster.classList.toggle("group", store.grouped);
     this.entries = new Map();
-    this.order = this.ranked = "";
+    this.key = this.order = "";
     if (!this.many) return;
     this.counts = this.roster.appendChild(make("p", { id: "counts" }));
     for (const robot of store.stage.robots) {
@@ -38,14 +38,13 @@ export class Cards {
     }
   }
 
-  draw({ tick, focus, truth }) {
-    const { store } = this, robots = store.stage.robots;
-    let shown = robots;
-    if (this.many) {
-      const chosen = store.chosen(focus);
-      shown = robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
-    }
-    if (!truth && focus) shown = shown.filter((robot) => robot.id === focus);
+  /** Shows the robots in `tick`; of many, the one with the `focus` or the first one that is `told` of, and its peer. */
+  draw({ tick, focus, truth, told }) {
+    const { store } = this, robots = store.stage.robots, subject = focus ?? told.find((one) => one.robots?.length)?.robots[0];
+    const key = [tick, focus, subject, truth, store.revision, Math.min(store.whole, tick), Boolean(store.scene(tick))].join();
+    if (key === this.key) return;
+    this.key = key;
+    const shown = store.few(subject, MANY).filter((robot) => truth || !focus || robot.id === focus);
     for (const [id, card] of this.cards) if (!shown.some((robot) => robot.id === id)) { card.root.remove(); this.cards.delete(id); }
     for (const robot of shown) {
       if (!this.cards.has(robot.id)) this.cards.set(robot.id, new Card(robot, this.choose));
@@ -53,19 +52,14 @@ export class Cards {
       if (this.root.children[shown.indexOf(robot)] !== card.root) this.root.append(card.root);
       card.draw(store, tick, truth, focus === robot.id);
     }
-    const key = [tick, focus, store.revision, Boolean(store.scene(tick))].join();
-    if (!this.many || key === this.ranked) return;
-    this.ranked = key;
+    if (!this.many) return;
     this.#rank(tick);
     for (const [id, entry] of this.entries) {
       const player = store.player(tick, id), phase = player ? store.phase(tick, id) : 0;
       const robot = robots[store.places.get(id)], state = task(player, robot);
       const text = `${id} ${player?.down ? "is down" : state}`;
-      if (entry.dataset.role !== robot.role) entry.dataset.role = robot.role;
       if (entry.textContent !== text) entry.textContent = text;
-      entry.dataset.phase = phase;
-      entry.setAttribute("aria-pressed", String(id === focus));
-      entry.setAttribute("aria-label", player?.activity ?? id);
+      for (const [name, value] of Object.entries({ "data-role": robot.role, "data-phase": phase, "aria-pressed": id === focus, "aria-label": player?.activity ?? id })) attribute(entry, name, String(value));
     }
   }
 
@@ -190,6 +184,11 @@ function believed({ local, world, probability: chances, covariance, localised })
   if (local.length > 1) return `${local.length} hypotheses in the anchor's frame`;
   if (local.length) return `${metres(Math.hypot(local[0][0], local[0][1]))} from its anchor, bearing unknown`;
   return "pose unknown";
+}
+
+/** Sets an attribute only if it changes: else the browser computes styles and the layout again. */
+export function attribute(element, name, value) {
+  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
 }
 
 export function make(tag, properties, ...children) {

@@ -2,8 +2,8 @@
 
 import { make } from "./cards.js";
 import * as data from "./data.js";
-import { distance, TAU } from "./geometry.js";
-import { circle, DASHED, OUTLINED, shape } from "./pen.js";
+import { distance } from "./geometry.js";
+import { circle, DASHED, OUTLINED, shape, stroked } from "./pen.js";
 
 /** The distance in pixels from a handle within which a pointer takes it. */
 const REACH_PX = 12;
@@ -164,8 +164,6 @@ export class Changes {
     const pen = plane.context;
     for (const { robot, x, at } of this.#handles) {
       const { role } = robots.find(({ id }) => id === robot), [px, py] = plane.at(at);
-      pen.lineWidth = 2;
-      pen.strokeStyle = look.robot[role];
       pen.fillStyle = look.paper;
       if (x === "x") shape(pen, role, px, py, this.values.robots[robot].heading, START_PX);
       else {
@@ -173,14 +171,8 @@ export class Changes {
         pen.rect(px - ANCHOR_PX, py - ANCHOR_PX, 2 * ANCHOR_PX, 2 * ANCHOR_PX);
       }
       pen.fill();
-      pen.stroke();
-      if (robot === this.robot.value) {
-        pen.setLineDash(OUTLINED);
-        pen.beginPath();
-        pen.arc(px, py, REACH_PX + 2, 0, TAU);
-        pen.stroke();
-      }
-      pen.setLineDash([]);
+      stroked(pen, look.robot[role], 2);
+      if (robot === this.robot.value) circle({ context: pen, at: () => [px, py], scale: 1 }, at, REACH_PX + 2, look.robot[role], 2, OUTLINED);
       if (x !== "x") circle(plane, at, this.values.sensing_range, look.robot[role], 1.5, DASHED);
     }
   }

@@ -1,7 +1,7 @@
 // Why exact distances leave several hypotheses: the mirror images of phase 1, and the crossings of an encounter.
 
 import { compose, distance, frame_of, step, TAU, wrap } from "./geometry.js";
-import { circle, DASHED, DOTTED, line } from "./pen.js";
+import { circle, DASHED, dot, DOTTED, line } from "./pen.js";
 import { joined, poses_of } from "./tints.js";
 import { metres } from "./words.js";
 
@@ -92,12 +92,7 @@ export class Construction {
       const path = found.path.map(about), met = found.turns.some((turn) => Math.abs(wrap(turn - angle)) < PASSING);
       found.distances.forEach((range, i) => circle(this.plane, path[i], range, met ? look.ink : look.link, met ? 2 : 1.2));
       line(pen, [found.anchor, ...path].map((one) => this.plane.at(one)), look.ink, 1.6);
-      pen.fillStyle = look.ink;
-      for (const place of found.places.map(about)) {
-        pen.beginPath();
-        pen.arc(...this.plane.at(place), 4.5, 0, TAU);
-        pen.fill();
-      }
+      for (const place of found.places.map(about)) dot(pen, this.plane.at(place), 4.5, look.ink);
     }
     pen.globalAlpha = 1;
     return (i) => turned >= 1 || found.turns[i] <= turned * TAU;

@@ -18,7 +18,8 @@ export const group_marks = (marks, team) => new Set([...[...marks].map((mark) =>
 export function draw_tree(pen, plane, { store, tick, look }) {
   const reach = store.stage.mission.sensing_range * plane.scale;
   for (const { visitor, visited } of store.stage.visits) {
-    const [from, to] = [visitor, visited].map((id) => plane.at(store.stage.robots[store.places.get(id)].anchor));
+    const anchors = [visitor, visited].map((id) => store.stage.robots[store.places.get(id)].anchor), [from, to] = anchors.map((one) => plane.at(one));
+    if (!plane.sees(...[Math.min, Math.max].map((end) => [0, 1].map((i) => end(...anchors.map((one) => one[i])))))) continue;
     const length = distance(from, to), done = store.role(tick, visited) === "a";
     if (length < 2 * reach) continue;
     const ahead = [(to[0] - from[0]) / length, (to[1] - from[1]) / length];

@@ -13,13 +13,14 @@ export const NAME = 2;
 export class Labels {
   /** Starts a picture of `width` x `height`; labels keep clear of `obstacles`, [left, top, right, bottom]. */
   constructor(pen, look, width, height, obstacles) {
-    Object.assign(this, { pen, look, width, height, placed: [...obstacles], asked: [] });
+    Object.assign(this, { pen, look, width, height, placed: [...obstacles], lines: [], asked: [] });
     /** The drawn labels as { text, box }. */
     this.drawn = [];
   }
 
   /**
-   * Asks for a label at (x, y). A label is left out where there is no room for it; those of higher `rank` are placed first.
+   * Asks for a label at (x, y). A label is left out where there is no room for it; those of higher `rank` are placed first,
+   * and names over lines rather than not at all.
    *
    * `align` is "left", "right" or "center"; `around` is the distance to what is labelled, for places on its other sides;
    * `others` are further positions [x, y].
@@ -33,7 +34,7 @@ export class Labels {
     const parts = Math.min(Math.ceil(Math.hypot(to_x - x, to_y - y) / EVERY), MOST_PARTS);
     for (let k = 0; k <= parts; k++) {
       const at = [x + (k / Math.max(parts, 1)) * (to_x - x), y + (k / Math.max(parts, 1)) * (to_y - y)];
-      this.placed.push([at[0] - HALF, at[1] - HALF, at[0] + HALF, at[1] + HALF]);
+      this.lines.push([at[0] - HALF, at[1] - HALF, at[0] + HALF, at[1] + HALF]);
     }
   }
 
@@ -43,8 +44,8 @@ export class Labels {
       pen.font = one.font;
       const wide = pen.measureText(one.text).width, tall = Number(/(\d+(\.\d+)?)px/.exec(one.font)[1]);
       const spots = [[one.x, one.y], ...one.others].flatMap(([x, y]) => this.#spots({ ...one, x, y }, tall));
-      const spot = spots.map(([x, y, align]) => ({ x, y, align, box: box_of(x, y, align, wide, tall) }))
-        .find(({ box }) => this.#free(box));
+      const places = spots.map(([x, y, align]) => ({ x, y, align, box: box_of(x, y, align, wide, tall) }));
+      const spot = places.find(({ box }) => this.#free(box, this.placed) && this.#free(box, this.lines)) ?? (one.rank === NAME && places.find(({ box }) => this.#free(box, this.placed)));
       if (!spot) continue;
       this.placed.push(spot.box);
       this.drawn.push({ text: one.text, box: spot.box });
@@ -74,9 +75,9 @@ export class Labels {
     return spots;
   }
 
-  #free([left, top, right, bottom]) {
+  #free([left, top, right, bottom], taken) {
     if (left < 0 || top < 0 || right > this.width || bottom > this.height) return false;
-    return this.placed.every(([l, t, r, b]) => right + GAP <= l || r + GAP <= left || bottom + GAP <= t || b + GAP <= top);
+    return taken.every(([l, t, r, b]) => right + GAP <= l || r + GAP <= left || bottom + GAP <= t || b + GAP <= top);
   }
 }
 

@@ -39,7 +39,7 @@ const MOMENTARY = {
   crossing: [drawn('<circle cx="10" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-dasharray="6 4"/><circle cx="20" cy="8" r="7" fill="none" stroke="var(--ghost)" stroke-width="2" stroke-dasharray="1.5 4"/>'), "turned about its anchor, the driven path fits where the circles cross"],
   distance: [drawn(`${GLOW}<path d="M1 8h28" stroke="var(--range)" stroke-width="2"/>`), ({ team }) => `distance to ${team ? "an" : "the"} anchor`],
   turned: [drawn(`<path ${POINTED} fill="none" stroke="var(--faint)" stroke-opacity="0.7"/>`), "turned around the anchor: just as possible"],
-  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="1.6" stroke-dasharray="3 2.2"/>`), "hypothesis: a pose (place and heading) that a robot may have"],
+  pose: [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-width="2"/>`), "hypothesis: a pose (place and heading) that a robot may have"],
   "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="3 2.2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
   ellipse: [drawn('<ellipse cx="15" cy="8" rx="12" ry="5.5" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma)"],
   arc: [drawn('<path d="M2 13q13-15 26 0l-4 2q-9-9-18 0z" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma): along an arc"],
@@ -63,7 +63,7 @@ const BANDS = drawn('<path d="M1 8h9" stroke="var(--faint)" stroke-width="3"/><p
 /** The signs above the time line. */
 const TIMES = {
   contact: "robots in range (shaded)", claim: "a robot claims its pose", inconsistent: "a contradiction is found",
-  several: "number of hypotheses of a robot", undecided: "a robot stops without a claim", down: "a process is gone", back: "a process is back",
+  several: "number of hypotheses of a robot", undecided: "a robot has no claim, or withdraws it", down: "a process is gone", back: "a process is back",
 };
 
 export class Legend {
@@ -100,9 +100,12 @@ export class Legend {
 
 const title = (words) => make("li", { className: "title", textContent: words });
 
+const entries = {};
+/** Returns the line of the legend with `picture` and `words`; the same one at each call. */
 function entry(picture, words) {
+  if (entries[picture + words]) return entries[picture + words];
   const item = make("li");
   item.innerHTML = picture;
   item.append(make("span", { textContent: words }));
-  return item;
+  return entries[picture + words] = item;
 }

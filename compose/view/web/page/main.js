@@ -3,7 +3,7 @@
 import { address_state } from "./address.js";
 import { estimate } from "./estimate.js";
 import { sweep } from "./sweep.js";
-import { Cards, make } from "./cards.js";
+import { attribute, Cards, make } from "./cards.js";
 import { Changes } from "./changes.js";
 import { Charts } from "./charts.js";
 import * as data from "./data.js";
@@ -351,8 +351,8 @@ function controls() {
   attribute($("guide"), "aria-pressed", String(view.guided));
   attribute($("caption"), "aria-live", view.guided && view.playing ? "polite" : "off");
   attribute($("camera"), "aria-pressed", String(plane.following));
-  $("follow").hidden = !store.live;
-  $("change").hidden = !changeable();
+  hide($("follow"), !store.live);
+  hide($("change"), !changeable());
   attribute($("change"), "aria-expanded", String(changes.open));
   attribute($("follow"), "aria-pressed", String(view.follow));
   $("truth").checked = view.truth;
@@ -361,7 +361,7 @@ function controls() {
   if ($("speed").value !== String(view.speed)) $("speed").value = String(view.speed);
   const notes = store.state.notes.join(" · ");
   text($("notes"), notes);
-  $("notes").hidden = !notes;
+  hide($("notes"), !notes);
   const subject = view.focus ?? "each robot";
   const bearing = store.stage.team || knows_bearing() ? "" : "; the bearing from the anchor is arbitrary until the robot is placed in the world";
   const only = store.has_truth ? `only the belief of ${subject}` : `no ground truth: only the belief of ${subject}`;
@@ -375,9 +375,8 @@ function knows_bearing() {
   return players.filter((player) => !view.focus || player.robot === view.focus).every((player) => player.held?.world.length);
 }
 
-/** Sets an attribute only if it changes: else the browser computes styles again in each frame. */
-function attribute(element, name, value) {
-  if (element.getAttribute(name) !== value) element.setAttribute(name, value);
+function hide(element, hidden) {
+  if (element.hidden !== hidden) element.hidden = hidden;
 }
 
 function text(element, content) {
@@ -465,21 +464,15 @@ function pressed(event) {
 release_focus();
 document.addEventListener("keydown", pressed);
 on_clock(follow_clock);
-$("play").addEventListener("click", () => play());
-$("back").addEventListener("click", () => go(view.tick - 1));
-$("on").addEventListener("click", () => go(view.tick + 1));
-$("first").addEventListener("click", () => go(store.first));
-$("last").addEventListener("click", () => go(store.last));
-$("follow").addEventListener("click", () => go(store.last));
+const CLICKS = {
+  play: () => play(), back: () => go(view.tick - 1), on: () => go(view.tick + 1), first: () => go(store.first), last: () => go(store.last),
+  follow: () => go(store.last), guide: () => guided(!view.guided), camera: () => follow_story(), fit, change: () => change(),
+  near: () => plane.near(store, view), help: () => $("keys").showModal(),
+};
+for (const [id, action] of Object.entries(CLICKS)) $(id).addEventListener("click", action);
 $("truth").addEventListener("change", () => show_truth($("truth").checked));
 $("robot").addEventListener("change", () => focus($("robot").value || null));
 $("speed").addEventListener("change", () => guided(false, Number($("speed").value)));
-$("guide").addEventListener("click", () => guided(!view.guided));
-$("camera").addEventListener("click", () => follow_story());
-$("fit").addEventListener("click", fit);
-$("change").addEventListener("click", () => change());
-$("near").addEventListener("click", () => plane.near(store, view));
-$("help").addEventListener("click", () => $("keys").showModal());
 $("view").addEventListener("submit", (event) => event.preventDefault());
 $("speed").append(...SPEEDS.map((speed) => make("option", { value: speed, textContent: speed })));
 $("key-list").append(...KEYS.flatMap(([key, action]) => [make("dt", {}, make("kbd", { textContent: key })), make("dd", { textContent: action })]));

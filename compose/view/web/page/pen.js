@@ -28,37 +28,41 @@ export const DOTTED = [1.5, 5], DASHED = [7, 5];
 /** The dashes of the outline of a robot. */
 export const OUTLINED = [3, 2.2];
 
-/** Draws a line through `points`, in pixels. */
-export function line(pen, points, colour, width, dash = []) {
+/** Strokes the path of `pen`. */
+export function stroked(pen, colour, width, dash = []) {
   pen.strokeStyle = colour;
   pen.lineWidth = width;
   pen.setLineDash(dash);
-  pen.beginPath();
-  for (const point of points) pen.lineTo(...point);
   pen.stroke();
   pen.setLineDash([]);
 }
 
+/** Draws a line through `points`, in pixels. */
+export function line(pen, points, colour, width, dash = []) {
+  pen.beginPath();
+  for (const point of points) pen.lineTo(...point);
+  stroked(pen, colour, width, dash);
+}
+
+/** Draws a full circle; all in pixels. */
+export function dot(pen, [x, y], radius, colour) {
+  pen.beginPath();
+  pen.arc(x, y, radius, 0, TAU);
+  pen.fillStyle = colour;
+  pen.fill();
+}
+
 /** Draws a circle about a place of the plane; `radius` is in m, `width` and `dash` are in pixels. */
 export function circle(plane, centre, radius, colour, width, dash = []) {
-  const pen = plane.context;
-  pen.strokeStyle = colour;
-  pen.lineWidth = width;
-  pen.setLineDash(dash);
-  pen.beginPath();
-  pen.arc(...plane.at(centre), radius * plane.scale, 0, TAU);
-  pen.stroke();
-  pen.setLineDash([]);
+  plane.context.beginPath();
+  plane.context.arc(...plane.at(centre), radius * plane.scale, 0, TAU);
+  stroked(plane.context, colour, width, dash);
 }
 
 /** Draws the outline of a robot. */
 export function outlined(pen, role, [x, y], heading, size, colour, width, dash = []) {
   shape(pen, role, x, y, heading, size);
-  pen.strokeStyle = colour;
-  pen.lineWidth = width;
-  pen.setLineDash(dash);
-  pen.stroke();
-  pen.setLineDash([]);
+  stroked(pen, colour, width, dash);
 }
 
 /** Draws a cross over a robot. */
@@ -68,8 +72,11 @@ export function cross(pen, x, y, size, look) {
 }
 
 export class Look {
-  constructor(style) {
-    const of = (name) => style.getPropertyValue(`--${name}`).trim();
+  #pale = {};
+
+  /** `of` returns the value of a colour or of the font by its name. */
+  constructor(of) {
+    this.of = of;
     for (const name of ["ink", "paper", "faint", "grid", "disc", "ring", "orbit", "ghost", "cloud", "range", "link", "fault", "now"]) {
       this[name] = of(name);
     }
@@ -79,6 +86,12 @@ export class Look {
     const size = 12.5;
     this.font = `${size}px ${family}`;
     this.bold = `600 ${size + 2.5}px ${family}`;
+  }
+
+  /** Returns the colour `#rrggbb` with an opacity of `percent` on the paper. */
+  pale(colour, percent) {
+    const part = (hex, at) => parseInt(hex.slice(at, at + 2), 16), mixed = (at) => part(this.paper, at) + (percent / 100) * (part(colour, at) - part(this.paper, at));
+    return this.#pale[colour + percent] ??= `rgb(${[1, 3, 5].map((at) => Math.round(mixed(at)))})`;
   }
 
   /** Returns the colour of a configuration by its number from 0. */

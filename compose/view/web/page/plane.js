@@ -8,7 +8,8 @@ import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
 import { heads, links } from "./group.js";
 import { Labels, NAME } from "./labels.js";
-import { circle, cross, line, Look, OUTLINED, outlined, shape, unit } from "./pen.js";
+import { cross, dot, line, Look, OUTLINED, outlined, shape, stroked, unit } from "./pen.js";
+import { palette } from "./strip.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
@@ -29,7 +30,7 @@ const ALL_DRAWN = 8; // robots that are all drawn, also those that are out of vi
 const LEAST_PX = 40;
 /** The sides of the small map of a group as shares of the plane's, and the least zoom of the camera with which it is drawn. */
 const INSET = 0.2, ZOOMED = 2.5;
-/** The largest group whose robots always have their names. */
+/** The largest number of robots that always have their names. */
 const NAMED = 20;
 
 /** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
@@ -97,6 +98,7 @@ export class Plane {
   #signals;
   #configurations;
   #construction;
+  #look = null;
   #revision = -1;
   #pointer = null;
 
@@ -221,6 +223,12 @@ export class Plane {
     return [this.centre[0] + (x - this.width / 2) / this.scale, this.centre[1] - (y - this.height / 2) / this.scale];
   }
 
+  /** Returns whether the box with the corners `least` and `most`, in m, is in view. */
+  sees(least, most) {
+    const [low, high] = [[0, this.height], [this.width, 0]].map((corner) => this.world(corner));
+    return least.every((one, i) => one <= high[i]) && most.every((one, i) => one >= low[i]);
+  }
+
   draw(store, { tick, share, focus, truth, moving, eliminated, planned, turned, selected }) {
     this.#measure();
     const ratio = (window.devicePixelRatio || 1) * unit();
@@ -237,8 +245,7 @@ export class Plane {
       this.tints.forget();
       this.#revision = store.revision;
     }
-    const look = new Look(getComputedStyle(document.documentElement));
-    const pen = this.context;
+    const of = palette(), look = this.#look?.of === of ? this.#look : this.#look = new Look(of), pen = this.context;
     pen.setTransform(ratio, 0, 0, ratio, 0, 0);
     pen.clearRect(0, 0, this.width, this.height);
     pen.lineCap = pen.lineJoin = "round";
@@ -283,9 +290,7 @@ export class Plane {
     const pen = this.context;
     pen.beginPath();
     pen.arc(...target.at, target.radius + 5, 0, TAU);
-    pen.strokeStyle = look.ink;
-    pen.lineWidth = 1.5;
-    pen.stroke();
+    stroked(pen, look.ink, 1.5);
   }
 
   /** Returns the size in pixels with which robots are drawn. */
@@ -334,7 +339,7 @@ export class Plane {
     pen.lineWidth = 1;
     pen.fillRect(left, top, wide, tall);
     pen.strokeRect(left, top, wide, tall);
-    for (const { id, role } of robots) if (places.get(id)) circle({ context: pen, at, scale: 1 }, places.get(id), 1.5, look.robot[role], 3);
+    for (const { id, role } of robots) if (places.get(id)) dot(pen, at(places.get(id)), 3, look.robot[role]);
     pen.strokeStyle = look.ink;
     pen.strokeRect(x - half[0], y - half[1], 2 * half[0], 2 * half[1]);
   }
@@ -384,7 +389,7 @@ export class Plane {
     this.marks.add(down ? "down" : `robot-${robot.role}`);
     this.targets.push({ kind: "robot", robot: robot.id, at: [x, y], radius: size });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
-    if (size > 6 || down || robot.id === focus || (store.grouped && store.places.size <= NAMED)) {
+    if (size > 6 || down || robot.id === focus || store.places.size <= NAMED) {
       const name = down ? `${robot.id} is down` : robot.id;
       this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, rank: NAME, around: size + 4 });
     }

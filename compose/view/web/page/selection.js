@@ -68,7 +68,7 @@ export class Tip {
   /** Shows the numbers of `target`, in a plane of `width` x `height`; hides the label if there is no target. */
   draw(view, target, [width, height], unit) {
     const { element } = this;
-    element.hidden = !target;
+    if (element.hidden === Boolean(target)) element.hidden = !target;
     if (!target) return;
     const lines = numbers(view, target).join("\n");
     if (element.textContent !== lines) element.textContent = lines;

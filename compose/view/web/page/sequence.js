@@ -31,7 +31,7 @@ export class Sequence {
   /** Draws the ticks around the current one. */
   draw(store, { tick, focus }) {
     if (!this.box.open) return;
-    const { canvas } = this, robots = shown(store, focus);
+    const { canvas } = this, robots = store.few(focus, MOST_LANES);
     const of = palette(), size = extent(canvas), tall = TOP + LANE * (robots.length + 1);
     resize(canvas, size, tall);
     const pen = fresh_pen(canvas, size.ratio, of);
@@ -123,14 +123,6 @@ function told(store, tick, rows) {
     ...shown.map((passage) => `${passage.sender}'s report of tick ${passage.tick} to ${passage.receiver}: ${fate_of(passage, tick)}`),
     ...events.filter(({ kind, robot }) => PROCESS.has(kind) && rows.has(robot)).map((event) => event.text),
   ];
-}
-
-/** Returns the robots with a lane: all if they are few, else the chosen one and its peer. */
-function shown(store, focus) {
-  const { robots } = store.stage;
-  if (robots.length <= MOST_LANES) return robots;
-  const chosen = store.chosen(focus);
-  return robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
 }
 
 function fate_of({ what, tick }, now) {

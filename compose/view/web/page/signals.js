@@ -1,8 +1,8 @@
 // Drawings of measured ranges, contacts and reports.
 
-import { distance, TAU } from "./geometry.js";
+import { distance } from "./geometry.js";
 import { held_now, leads } from "./held.js";
-import { circle, cross, DASHED, fading, line, OUTLINED } from "./pen.js";
+import { circle, cross, DASHED, dot, fading, line, OUTLINED, stroked } from "./pen.js";
 import { metres } from "./words.js";
 
 const MOST_ORIGINS = 6;
@@ -131,15 +131,8 @@ export class Signals {
     pen.globalAlpha = before * alpha;
     this.plane.marks.add(sign === "heard" ? "report" : sign);
     if (sign === "late") line(pen, [behind, [x, y]], look.link, 4);
-    pen.beginPath();
-    pen.arc(x, y, Math.min(5, 0.5 * size), 0, TAU);
-    pen.fillStyle = sign === "heard" || sign === "late" ? look.link : look.paper;
-    pen.fill();
-    pen.strokeStyle = sign === "lost" || sign === "damaged" ? look.fault : look.link;
-    pen.lineWidth = 1.8;
-    pen.setLineDash(sign === "lost" ? OUTLINED : []);
-    pen.stroke();
-    pen.setLineDash([]);
+    dot(pen, [x, y], Math.min(5, 0.5 * size), sign === "heard" || sign === "late" ? look.link : look.paper);
+    stroked(pen, sign === "lost" || sign === "damaged" ? look.fault : look.link, 1.8, sign === "lost" ? OUTLINED : []);
     if (sign === "damaged") cross(pen, x, y, 5, look);
     pen.globalAlpha = before;
   }

@@ -86,6 +86,12 @@ export class Store {
     return named(focus) ?? named(visits?.[0]?.visitor) ?? robots[0];
   }
 
+  /** Returns all robots if they are at most `most`, else the chosen one and its peer. */
+  few(focus, most) {
+    const { robots } = this.stage, chosen = this.chosen(focus);
+    return robots.length <= most ? robots : robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
+  }
+
   /** Gives `tick` priority in the background fetches. */
   want(tick) {
     this.wanted = tick;

@@ -2,10 +2,15 @@
 
 import { unit } from "./pen.js";
 
-/** Returns a function that returns the present value of a colour or of the font of the page, by its name. */
-export function palette() {
-  const style = getComputedStyle(document.documentElement);
-  return (name) => style.getPropertyValue(`--${name}`).trim();
+let present = null;
+matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { present = null; });
+
+/** Returns a function that returns the present value of a colour or of the font of the page, by its name; the same one while these stay. */
+export const palette = () => present ??= values();
+
+function values() {
+  const style = getComputedStyle(document.documentElement), known = {};
+  return (name) => known[name] ??= style.getPropertyValue(`--${name}`).trim();
 }
 
 /** Returns the width of a canvas in units of drawings, and the number of its pixels per unit. */

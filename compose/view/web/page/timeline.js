@@ -81,12 +81,7 @@ export class Timeline {
     const { store, canvas } = this;
     this.#read();
     this.last = Math.max(store.last, 0);
-    const robots = store.stage.robots;
-    let shown = robots;
-    if (robots.length > (store.grouped ? MOST_GROUP_BANDS : MOST_BANDS)) {
-      const chosen = store.chosen(focus);
-      shown = robots.filter((robot) => robot === chosen || robot.id === chosen.peer);
-    }
+    const shown = store.few(focus, store.grouped ? MOST_GROUP_BANDS : MOST_BANDS);
     const of = palette(), size = extent(canvas), { wide, ratio } = size;
     const band = shown.length > 3 ? 9 : 14, tall = MARKS + shown.length * (band + 3) + 15;
     resize(canvas, size, tall);

@@ -45,17 +45,20 @@ export class Trails {
   /** Discards the cached paths, because the scenes have changed. */
   forget() { this.#chunks.clear(); }
 
-  /** Draws a trail of `robot` up to the tick. */
-  trail(pen, view, robot, kind) {
-    const { store, tick } = view, last = Math.min(tick, store.last);
-    this.#stroked(pen, view, robot, kind, (stroke) => {
-      for (let from = store.first; from < last;) {
-        const long = from + CHUNK <= last - OLD && (from - store.first) % CHUNK === 0, end = from + (long ? CHUNK : STEP), to = Math.min(end, last);
-        const strength = PAST + (1 - PAST) * Math.max(0, 1 - Math.max(0, last - end) / OLD);
-        for (const piece of this.#pieces(store, robot, kind, from, to, to === end)) stroke(piece, strength);
-        from = to;
+  /** Draws the trails of `robots` up to the tick, as far as they are in view: all pieces of one style at once. */
+  trails(pen, view, robots) {
+    const { store, tick, focus } = view, { plane } = this, last = Math.min(tick, store.last), styles = new Map();
+    for (const robot of robots) for (const kind of kinds_of(robot)) for (let from = store.first, to; from < last; from = to) {
+      const long = from + CHUNK <= last - OLD && (from - store.first) % CHUNK === 0, end = from + (long ? CHUNK : STEP);
+      const strength = PAST + (1 - PAST) * Math.max(0, 1 - Math.max(0, last - end) / OLD);
+      to = Math.min(end, last);
+      for (const { path, least, most, phase, role } of this.#pieces(store, robot, kind, from, to)) {
+        const key = `${kind.name}/${phase}/${role}/${strength}/${focus && robot.id !== focus}`;
+        if (!styles.has(key)) styles.set(key, { robot, kind, strength, piece: { path: new Path2D(), phase, role } });
+        if (plane.sees(least, most)) styles.get(key).piece.path.addPath(path);
       }
-    });
+    }
+    for (const { robot, kind, strength, piece } of styles.values()) this.#stroked(pen, view, robot, kind, (stroke) => stroke(piece, strength));
   }
 
   /**
@@ -72,7 +75,7 @@ export class Trails {
     if (!told && (!searching || player.contacts?.length || !lacks_bearing(held) || size <= LEAST_PX)) return;
     this.plane.marks.add("turned");
     const [x, y] = robot.anchor, alpha = told ? fading(share, moving) : 0;
-    const pieces = alpha > 0 ? this.#pieces(store, robot, TRUE, store.first, Math.min(tick, store.last), false) : [];
+    const pieces = alpha > 0 ? this.#pieces(store, robot, TRUE, store.first, Math.min(tick, store.last)) : [];
     const turns = alpha > 0 ? TURNS : LATER_TURNS;
     for (let i = 1; i < turns; i++) {
       const angle = (i * TAU) / turns, turn = compose([x, y, angle], [-x, -y, 0]);
@@ -113,7 +116,7 @@ export class Trails {
     pen.setTransform(ratio * s, 0, 0, -ratio * s, ratio * (wide / 2 - centre[0] * s), ratio * (height / 2 + centre[1] * s));
     draw(({ path, phase, role }, strength = 1) => {
       const hue = kind === REPORTED ? look.fault : look.robot[role];
-      pen.strokeStyle = strength < 1 ? `color-mix(in srgb, ${hue} ${Math.round(100 * strength)}%, ${look.paper})` : hue;
+      pen.strokeStyle = strength < 1 ? look.pale(hue, Math.round(100 * strength)) : hue;
       const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
       this.plane.marks.add(kind === REPORTED ? "reported" : `path-${phase}`);
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
@@ -123,12 +126,21 @@ export class Trails {
     pen.restore();
   }
 
-  /** Returns the trail from tick `from` to `to` in pieces { path, phase, role } of one style; cached once it is complete. */
-  #pieces(store, robot, kind, from, to, whole) {
+  /**
+   * Returns the trail from tick `from` to `to` in pieces { path, least, most, phase, role } of one style; cached once it is complete.
+   *
+   * `least` and `most` are the corners of a box around `path`.
+   */
+  #pieces(store, robot, kind, from, to) {
     const key = `${kind.name}/${robot.id}/${from}/${to - from}`, cached = this.#chunks.get(key);
-    if (cached && whole) return cached;
+    if (cached) return cached;
     const pieces = [], period = store.stage.mission.period;
     let path = null, phase = null, role = null, complete = true;
+    const to_pose = ([x, y]) => {
+      const { least, most } = pieces.at(-1);
+      path.lineTo(x, y);
+      [x, y].forEach((one, i) => { least[i] = Math.min(least[i], one); most[i] = Math.max(most[i], one); });
+    };
     for (let k = from; k < to; k++) {
       const here = store.player(k, robot.id), next = store.player(k + 1, robot.id);
       const start = kind.pose(here), end = kind.pose(next);
@@ -142,18 +154,15 @@ export class Trails {
       if (now !== phase || hue !== role || !path) {
         path = new Path2D();
         path.moveTo(start[0], start[1]);
-        pieces.push({ path, phase: now, role: hue });
+        pieces.push({ path, least: start.slice(0, 2), most: start.slice(0, 2), phase: now, role: hue });
         phase = now;
         role = hue;
       }
       const driven = kind.driven(here, next, period), bends = bends_of(driven, period);
-      for (let bend = 1; bend < bends; bend++) {
-        const pose = between(start, end, driven, bend / bends, period);
-        path.lineTo(pose[0], pose[1]);
-      }
-      path.lineTo(end[0], end[1]);
+      for (let bend = 1; bend < bends; bend++) to_pose(between(start, end, driven, bend / bends, period));
+      to_pose(end);
     }
-    if (whole && complete) this.#chunks.set(key, pieces);
+    if (complete) this.#chunks.set(key, pieces);
     return pieces;
   }
 
