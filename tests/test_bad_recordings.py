@@ -85,7 +85,7 @@ def test_an_invalid_row_is_one_line_with_its_place(
         (
             "VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 B0 1 1",
             ", line 2: B is neither a robot with odometry nor a known anchor; robots: A; "
-            "anchors: none, and --anchors FILE adds some",
+            "anchors: none; --anchors FILE adds some, without x and y if unknown",
         ),
         ("VERTEX_SE2 0 A0 0 0 0\nEDGE_RANGE 0 A0 L0 1 0", ", line 2: variance: 0 is not positive"),
         (

@@ -83,13 +83,13 @@ def _bound(group: Mapping[str, Any], robots: Mapping[str, Mapping[str, Any]]) ->
 
 
 def unverified(anchors: Sequence[str], file: str) -> str:
-    """Return the sentence on the anchors of which no range tells whether they stand elsewhere than told.
+    """Return the sentence on the anchors of which no range tells whether they stand as far off as `accuracy`.
 
     `file` is the name of the file that tells more.
     """
     named = listed(anchors, MOST_NAMED_ROBOTS, "more anchors")
     stand = "stand" if len(anchors) > 1 else "stands"
-    return f"no range tells whether {named} {stand} elsewhere than told; {file} has the directions"
+    return f"no range tells whether {named} {stand} off by the accuracy of a claim; {file} has the directions"
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:

@@ -284,8 +284,9 @@ class RecordingBuilder:
         robots, anchors = [
             listed(some) for some in (names[: len(self._odometry)], names[len(self._odometry) :])
         ]
-        there = f"robots: {robots}; anchors: {anchors or 'none, and --anchors FILE adds some'}"
-        return f"is neither a robot with odometry nor a known anchor; {there}{did_you_mean(name, names)}"
+        advice = did_you_mean(name, names) or "; --anchors FILE adds some, without x and y if unknown"
+        there = f"robots: {robots}; anchors: {anchors or 'none'}{advice}"
+        return f"is neither a robot with odometry nor a known anchor; {there}"
 
     def _range_series(self, names: Sequence[str], through_s: float) -> RangeSeries:
         radios = {name: i for i, name in enumerate(names)}
