@@ -32,7 +32,7 @@ from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.hunt import coverage, examination
+from compose.sweep.hunt import coverage, examination, exploration
 from compose.sweep.hunt.examination import (
     MOST_TICKS,
     MOST_WITHOUT_END,
@@ -103,8 +103,22 @@ def test_a_hunt_reaches_the_same_with_any_number_of_workers() -> None:
 def test_a_long_run_that_is_nearer_to_a_bound_does_not_replace_a_short_one() -> None:
     hunt = Hunt("random-group", 1, 1)
     for ticks, share in ((2000, 0.9), (100, 0.8), (110, 0.7)):
-        hunt._keep({}, Examined(known=Clues(("r1",), ticks), bound_shares=(share,)))
+        hunt._keep({"mission": {}}, Examined(known=Clues(("r1",), ticks), bound_shares=(share,)))
     assert sorted([share for share, _ in hunt.slowest.values()]) == [0.8, 0.9]
+
+
+def test_a_fifth_of_the_time_is_for_changes_of_the_inputs_nearest_to_a_bound(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(exploration, "mutated", lambda *given: {**given[0], "climbs": len(given) > 3})
+    hunt, spent = Hunt("random-group", 1, 1), {True: 0.0, False: 0.0}
+    for number in range(60):
+        for one in hunt._batch(number):
+            near = number == 0 or one.get("climbs", False)
+            known = Clues(("r1",), 200 if near else 400)
+            hunt._keep(one, Examined((), frozenset(("a",)), known, (0.5,) * near))
+            spent[one.get("climbs", False)] += 1.0 / exploration.CorpusEntry(one, known).share
+    assert spent[True] / sum(spent.values()) == pytest.approx(exploration.SLOWEST_SHARE, abs=0.02)
 
 
 def steps_twice(real: Any) -> Any:

@@ -43,10 +43,7 @@ PROCESSES_EACH = 100
 JOINED_SHARE = 0.15
 """The share of inputs that get a part of another input before they are changed."""
 SLOWEST_SHARE = 0.2
-"""The share of inputs that are changes of those that came nearest to a computed bound.
-
-If their runs take longer than others, it is the share of the time.
-"""
+"""The share of the time for changes of the inputs that came nearest to a computed bound."""
 NEARER = 8
 """The power of the share of its bound by which such an input is chosen: the slowest runs take longest."""
 NOISY_SLOWER = 8.0
@@ -109,8 +106,8 @@ class Hunt:
         """The inputs that reached something new."""
         self._energies: list[float] = []
         """The frequencies of changes of these inputs."""
-        self._usual = 1.0
-        """The `share` of an input whose run takes the mean time of their changes."""
+        self._spent = self._climbed = 0.0
+        """The time of all runs, and of changes of `slowest`, in units of one whose `share` is 1."""
         self.slowest: dict[tuple[int, int, int], tuple[float, CorpusEntry]] = {}
         """The inputs whose runs used most of a bound, with the share, by number of bounds, place and length.
 
@@ -147,9 +144,6 @@ class Hunt:
         self._energies = [
             one.share / math.sqrt(min([self.seen[state] for state in one.reached])) for one in self.corpus
         ]
-        if self.corpus:
-            times = [energy / one.share for energy, one in zip(self._energies, self.corpus, strict=True)]
-            self._usual = sum(self._energies) / sum(times)
         return [*left, *[self._input(draw) for _ in range(BATCH - len(left))]]
 
     def _input(self, draw: random.Random) -> Table:
@@ -158,11 +152,11 @@ class Hunt:
             firsts = self._first[: 1 + len(self.corpus)] if self._guided else self._first
             [first] = draw.choices(firsts, [math.sqrt(one.share) if self._guided else 1.0 for one in firsts])
             return mutated(first.table, first.known, draw)
-        if self.slowest:
+        if self.slowest and self._climbed < SLOWEST_SHARE * self._spent:
             near = [*self.slowest.values()]
             [(_, entry)] = draw.choices(near, [share**NEARER * one.share for share, one in near])
-            if draw.random() < SLOWEST_SHARE * min(1.0, entry.share / self._usual):
-                return mutated(entry.table, entry.known, draw, WITHIN_BOUNDS)
+            self._climbed += 1.0 / entry.share
+            return mutated(entry.table, entry.known, draw, WITHIN_BOUNDS)
         entry, other = draw.choices(self.corpus, self._energies, k=2)
         table = joined(entry.table, other.table, draw) if draw.random() < JOINED_SHARE else entry.table
         return mutated(table, entry.known, draw)
@@ -174,6 +168,7 @@ class Hunt:
         if not result.reached <= self.seen.keys():
             self.corpus.append(entry)
         self.seen.update(result.reached)
+        self._spent += 1.0 / entry.share if entry.known.robots else 0.0
         for place, share in enumerate(result.bound_shares):
             which = len(result.bound_shares), place, result.known.ticks.bit_length()
             if share > self.slowest.get(which, (0.0, None))[0]:
