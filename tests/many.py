@@ -52,9 +52,9 @@ class Series:
         seed = trial_seed(sweep.seed, cell.key, trial)
         table = cell.table if sweep.draws else {}
         chunk = Chunk(cell.index, (trial,), (seed,), self._settings[at], options, table)
-        signal.setitimer(signal.ITIMER_REAL, sweep.trial_timeout)
-        row = played(chunk, trial, seed)  # a mission that hangs fails
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
+        signal.setitimer(signal.ITIMER_PROF, sweep.trial_timeout)
+        row = played(chunk, trial, seed)  # one that uses more time fails; a stopped one does not
+        signal.setitimer(signal.ITIMER_PROF, 0.0)
         broken = self._broken(row, at)
         self.found.update(["missions", row.outcome, *["audited"] * audited, *["violated"] * bool(broken)])
         self.cpu_s += sum(os.times()[:4]) - began
@@ -82,7 +82,7 @@ def main(arguments: list[str]) -> int:
     stops = list[int]()  # `played` turns exceptions into failed missions
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda number, _: stops.append(number))
-    signal.signal(signal.SIGALRM, _hung)
+    signal.signal(signal.SIGPROF, _hung)
     while not stops and (left := [one for one in every if one.found["missions"] < one.most]):
         if broken := min(left, key=lambda one: one.found["missions"] / one.most).play():
             print(broken, flush=True)

@@ -3,7 +3,7 @@
 Each is planted in a process of its own, in which a hunt runs until it has found it or its workers have used S
 seconds of processor time: with the guide, and beside it by chance alone. A table says after how many runs and
 seconds, with those of shrinking the input, each was found, and what the guide found, with how many changes.
-`--write` replaces the table in docs/howto-hunt.md.
+`--write` replaces their rows in docs/howto-hunt.md; with `--guided-only`, the results by chance stay.
 """
 
 from __future__ import annotations
@@ -215,12 +215,15 @@ def hunted(mutant: Callable[[], None], source: str, cpu_s: float, *, guided: boo
     return f"run {found.runs}, {used():.0f} s: {found.breach.kind}, {changes} changes"
 
 
-def write(rows: list[str], cpu_s: float) -> None:
-    """Replace the table of PAGE by `rows`, with the processor time of each hunt."""
+def write(cells: list[str], cpu_s: float) -> None:
+    """Replace the row of a mutant in the table of PAGE by `cells`; what they lack stays."""
     before, _, rest = PAGE.read_text().partition(BEGIN)
-    _, _, after = rest.partition(END)
+    table, _, after = rest.partition(END)
+    rows = {one[0]: one for line in table.splitlines() if (one := line.strip("| ").split(" | "))[1:]}
+    rows[cells[0]] = [*cells, *rows.get(cells[0], [])[len(cells) :]]
     told = f"At most {cpu_s:g} s of one core for each hunt:"
-    PAGE.write_text(f"{before}{BEGIN}\n\n{told}\n\n" + "\n".join(rows) + f"\n\n{END}{after}")
+    lines = "\n".join([f"| {' | '.join(one)} |" for one in rows.values()])
+    PAGE.write_text(f"{before}{BEGIN}\n\n{told}\n\n{lines}\n\n{END}{after}")
 
 
 def main(arguments: list[str]) -> int:
@@ -234,8 +237,7 @@ def main(arguments: list[str]) -> int:
     by_name = {one.__name__: one for one in MUTANTS}
     chosen = [by_name[name] for name in options.name or by_name]
     missed = 0
-    rows = ["| mutant | guided | by chance |", "| --- | --- | --- |"]
-    print(*rows, sep="\n")
+    print("| mutant | guided | by chance |\n| --- | --- | --- |")
     for mutant in chosen:
         cells = [mutant.__name__]
         print(f"| {mutant.__name__}", end="", flush=True)
@@ -247,9 +249,8 @@ def main(arguments: list[str]) -> int:
             cells.append(says if guided else says.partition(":")[0])
             print(f" | {cells[-1]}", end="", flush=True)
         print(" |", flush=True)
-        rows.append(f"| {' | '.join(cells)} |")
         if options.write:
-            write(rows, options.cpu)
+            write(cells, options.cpu)
     return 0 if 10 * missed <= len(chosen) else 1
 
 
