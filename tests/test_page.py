@@ -62,8 +62,16 @@ def test_late_data_of_a_tick_appears_on_the_time_line_and_in_the_log(
         page.keyboard.press("Home")
         until_shown(page, 0)
         assert marks(page) == 0
+        for key, tick in (("End", 46), ("ArrowLeft", 45), ("ArrowRight", 46)):  # it does not follow the mission
+            page.keyboard.press(key)
+            until_shown(page, tick)
+        card = page.locator(".card[data-robot=a]")
+        expect(card).not_to_contain_text("b 2.95 m")
         grow(47, 47)
         expect(page.locator("#log")).to_contain_text("a and b are in range of each other: 2.95 m")
+        expect(card).to_contain_text("b 2.95 m")
+        page.keyboard.press("Home")
+        until_shown(page, 0)
         assert marks(page) > 20  # the mark of the contact
         grow(48, 48)
         expect(page.locator("#log")).to_contain_text("b has 4 hypotheses")
@@ -93,7 +101,7 @@ def test_a_killed_robot_keeps_its_phase_and_is_shown_as_down_until_it_is_back(
     scenario.write_text(ENDLESS)
     patient = ("--timeout", "600")
     with (
-        world(scenario, "--out", recording, *patient) as (_, endpoint),
+        world(scenario, "--out", recording, "--rate", "20", *patient) as (_, endpoint),
         TandemProcess("agent", "b", "--connect", endpoint, "--out", recording, *patient),
         watching(recording) as (_, of_journals),
         watching("--connect", endpoint) as (_, of_network),

@@ -41,9 +41,9 @@ export class Cards {
   /** Shows the robots in `tick`; of many, the one with the `focus` or the first one that is `told` of, and its peer. */
   draw({ tick, focus, truth, told }) {
     const { store } = this, robots = store.stage.robots, subject = focus ?? told.find((one) => one.robots?.length)?.robots[0];
-    const key = [tick, focus, subject, truth, store.revision, Math.min(store.whole, tick), Boolean(store.scene(tick))].join();
-    if (key === this.key) return;
-    this.key = key;
+    const key = [tick, focus, subject, truth, store.revision, Math.min(store.whole, tick)].join(), scene = store.scene(tick);
+    if (key === this.key && scene === this.scene) return; // the scene of the last tick is replaced when a process ends
+    Object.assign(this, { key, scene });
     const shown = store.few(subject, MANY).filter((robot) => truth || !focus || robot.id === focus);
     for (const [id, card] of this.cards) if (!shown.some((robot) => robot.id === id)) { card.root.remove(); this.cards.delete(id); }
     for (const robot of shown) {
