@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import socket
 from collections.abc import Iterator
@@ -124,7 +125,8 @@ def test_a_result_before_tick_0_does_not_keep_a_killed_robot_from_resuming(tmp_p
         first.tell(SIGKILL)
         first.ended()
     again = tandem(*robot, "--connect-timeout", "2")
-    assert again.err.splitlines()[-1] == "tandem robot a: b: not connected; no robot has moved"
+    said = again.err.splitlines()[-1]  # on a loaded machine, its own agent may still be starting
+    assert re.fullmatch("tandem robot a: (a and )?b: not connected; no robot has moved", said)
     assert again.status == 3
 
 

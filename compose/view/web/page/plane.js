@@ -30,7 +30,7 @@ const ALL_DRAWN = 8; // robots that are all drawn, also those that are out of vi
 const LEAST_PX = 40;
 /** The sides of the small map of a group as shares of the plane's, and the least zoom of the camera with which it is drawn. */
 const INSET = 0.2, ZOOMED = 2.5;
-/** The largest number of robots that always have their names. */
+/** The largest number of robots of a group that always have their names; those of one pair have them, too. */
 const NAMED = 20;
 
 /** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
@@ -389,7 +389,7 @@ export class Plane {
     this.marks.add(down ? "down" : `robot-${robot.role}`);
     this.targets.push({ kind: "robot", robot: robot.id, at: [x, y], radius: size });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
-    if (size > 6 || down || robot.id === focus || store.places.size <= NAMED) {
+    if (size > 6 || down || robot.id === focus || store.places.size <= (store.grouped ? NAMED : 2)) {
       const name = down ? `${robot.id} is down` : robot.id;
       this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, rank: NAME, around: size + 4 });
     }
