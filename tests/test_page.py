@@ -62,11 +62,7 @@ def test_late_data_of_a_tick_appears_on_the_time_line_and_in_the_log(
         page.keyboard.press("Home")
         until_shown(page, 0)
         assert marks(page) == 0
-        for key, tick in (
-            ("End", 46),
-            ("ArrowLeft", 45),
-            ("ArrowRight", 46),
-        ):  # it does not follow the mission
+        for key, tick in (("End", 46), ("ArrowLeft", 45), ("ArrowRight", 46)):  # then it follows no more
             page.keyboard.press(key)
             until_shown(page, tick)
         card = page.locator(".card[data-robot=a]")
