@@ -19,7 +19,7 @@ from compose.recording.run import read
 from compose.scenario.scenario_file import load
 from compose.view.recorded import scenes, scenes_of
 from compose.view.scene import Scene
-from compose.view.web.server import news_events
+from compose.view.web.server import SCENES_TOLD, news_events
 from compose.view.web.site import of_folder
 from compose.view.web.sources import Recorded
 from protocol.attack import Attack
@@ -119,6 +119,26 @@ def test_what_an_attack_cost_arrives_with_the_scene_that_tells_it(recording: Pat
     update = asyncio.run(asyncio.wait_for(told(), BOUND_S))
     assert update["from"] == update["last"]
     assert [scene["tick"] for scene in update["scenes"]] == [update["last"]]
+
+
+@pytest.mark.parametrize(("changed", "scenes_told"), [(SCENES_TOLD, SCENES_TOLD), (SCENES_TOLD + 1, 1)])
+def test_the_news_of_a_running_mission_have_the_few_scenes_that_changed_or_the_latest(
+    recording: Path, changed: int, scenes_told: int
+) -> None:
+    async def told() -> dict[str, Any]:
+        site = of_folder(recording)
+        (show,) = site.shows.values()
+        news = news_events(site, show.name, show.version)
+        await anext(news)
+        show.live = True
+        show.known.at(show.known.last - changed + 1)
+        show.revised()
+        return dict(json.loads((await anext(news)).removeprefix(b"data: "))["show"])
+
+    update = asyncio.run(asyncio.wait_for(told(), BOUND_S))
+    assert update["from"] == update["last"] - changed + 1
+    ticks = [scene["tick"] for scene in update["scenes"]]
+    assert ticks == list(range(update["last"] - scenes_told + 1, update["last"] + 1))
 
 
 # --- the page -----------------------------------------------------------------------------------------

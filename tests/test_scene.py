@@ -226,7 +226,10 @@ def test_a_robot_is_shown_as_down_in_every_tick_without_its_process(paper_1: Pat
     present(b=True)
     known.add(journals.known.final_reports["a"])
     present(a=False)  # its part of the mission has ended
+    for tick in (1, 3):
+        known.ticks[tick].late.add("a")  # every tick of a robot that is down: told once, as that
     shown = scenes(setup, known)
+    assert [event.tick for one in shown for event in one.events if event.kind == "late"] == [3]
     assert [one.player("a").down for one in shown] == [False, True, False, False]
     assert shown[1].player("a").activity == "a is down: its process is gone"
     assert [

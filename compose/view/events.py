@@ -153,7 +153,7 @@ def _deciding(
 ) -> Iterator[Event]:
     """Yield the changes of phase, state and verdict. Robots of groups and teams have states after a claim."""
     robot, tick = robot_setup.id, now.tick
-    if robot in now.late:
+    if robot in now.late and robot not in now.down:  # every tick of a robot that is down is late
         yield Event(tick, "late", robot, f"{robot} misses the deadline and stops for this tick")
     if robot in now.without:
         whose = "a" if setup.team else f"{robot_setup.peer}'s"

@@ -60,6 +60,8 @@ MOST_WAITING = 16
 """The maximum number of requests that are computed, or wait until they are."""
 LONGEST_SERIES_S = 10.0
 """The wall time in s that the series of one request may take."""
+SCENES_TOLD = 5
+"""The number of scenes in one event of the news. A page requests all others, in larger numbers."""
 MAX_CHANGE_BYTES = 8192
 """The maximum size of a request to change a mission."""
 NEWS = "/api/news"
@@ -315,8 +317,8 @@ def _json(value: object, status: int = 200) -> Response:
 async def news_events(site: Site, name: str | None, version: int) -> AsyncIterator[bytes]:
     """Yield server-sent events: the list of runs when it changes, and updates of the show called `name`.
 
-    An update has the state of the run, the first tick that changed since `version`, and the scene of the
-    latest tick if the run goes on or nothing else has changed.
+    An update has the state of the run, the first tick that changed since `version`, and the scenes from that
+    tick on, if these are at most SCENES_TOLD; else, while the run goes on, the scene of the latest tick.
     """
     listed: dict[str, Any] | None = None
     state: dict[str, Any] | None = None
@@ -333,7 +335,10 @@ async def news_events(site: Site, name: str | None, version: int) -> AsyncIterat
             if since is not None or now != state:
                 state = now
                 head = show.head
-                told = scenes(show.setup, show.known, head, head) if show.live or since == head else ()
+                first = head if since is None else min(since, head)
+                if head - first >= SCENES_TOLD:
+                    first = head if show.live else head + 1
+                told = scenes(show.setup, show.known, first, head)
                 event["show"] = {**now, "from": since, "robots": len(show.setup.robots), "scenes": told}
         if event:
             yield b"data: " + msgspec.json.encode(event) + b"\n\n"

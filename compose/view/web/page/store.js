@@ -23,6 +23,7 @@ export class Store {
   #whole = 0;
   #wake = null;
   #failed = 0;
+  #near = false;
   #stale = Infinity;
 
   get last() { return this.state.last; }
@@ -132,9 +133,11 @@ export class Store {
     while (this.scenes[this.#whole] || this.#whole < this.first) this.#whole += 1;
   }
 
+  /** Returns the tick from which to fetch; null if none is missing. Ticks near the wanted one and all others take turns. */
   #missing() {
+    this.#near = !this.#near;
     const near = Math.max(this.wanted - 3, this.first);
-    for (let tick = near; tick <= Math.min(this.wanted, this.last); tick++) if (!this.scenes[tick]) return tick;
+    if (this.#near) for (let tick = near; tick <= Math.min(this.wanted, this.last); tick++) if (!this.scenes[tick]) return tick;
     return this.#whole <= this.last ? this.#whole : null;
   }
 
