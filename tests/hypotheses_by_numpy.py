@@ -62,7 +62,7 @@ ARCCOS, ARCTAN2 = np.vectorize(math.acos), np.vectorize(math.atan2)
 
 
 class Residuals(NamedTuple):
-    """The residuals of n candidates for a placement, with N mutual ranges."""
+    """The residuals of n guesses for a placement, with N mutual ranges."""
 
     residuals: Array
     """The measured minus the predicted ranges (m); shape (n, N)."""
@@ -166,7 +166,7 @@ def _best(points: Array, likely: Array, near: float) -> Array:
 def _scanned(
     near: Encounter, far: Encounter, i: int, rho: float, apart: tuple[float, float], lever: Array
 ) -> Array:
-    """Return the candidates from the mutual range `rho` (m) with index `i`; shape (n, 8).
+    """Return the guesses from the mutual range `rho` (m) with index `i`; shape (n, 8).
 
     The columns are the rotations of the near and of the far robot, and the whitened offset of each.
     """
@@ -180,7 +180,7 @@ def _scanned(
     y = apart[1] + s * near.x[i] + c * near.y[i]
     gap = np.maximum(hypot(x, y), SIGMA_FLOOR)
     bearing = ARCTAN2(y, x) - math.atan2(far.y[i], far.x[i])
-    candidates = []
+    guesses = []
     for offset in offsets:
         radius = max(own + offset * uncertainty, SIGMA_FLOOR)
         opening = ARCCOS(np.clip((gap**2 + radius**2 - rho**2) / (2.0 * gap * radius), -1.0, 1.0))
@@ -189,8 +189,8 @@ def _scanned(
             z[:, 0], z[:, 1] = turn, bearing + way * opening
             if offset:
                 z[:, 5:8] = offset * outwards / uncertainty
-            candidates.append(z)
-    return np.concatenate(candidates)
+            guesses.append(z)
+    return np.concatenate(guesses)
 
 
 def turned_by_numpy(
@@ -211,7 +211,7 @@ def turned_by_numpy(
     steps = max(POLISHINGS + 1, 1 + math.ceil(math.log(finest / coarse) / math.log(FINER_TURN)))
     for step in range(steps):
         s = hypot(sigma, coarse * FINER_TURN**step)
-        unknowns = 8 if len(z) <= CROWD else 2  # of the many candidates of the scan, only the rotations
+        unknowns = 8 if len(z) <= CROWD else 2  # of the many guesses of the scan, only the rotations
         residuals, jacobian, _ = residuals_at(z, unknowns)
         weight = inlier_probability(residuals, s, pair.noise) / np.square(s)
         weighted = np.swapaxes(jacobian * weight[..., None], 1, 2)
@@ -300,7 +300,7 @@ def likeliest(
 ) -> tuple[Array, Array]:
     """Return the most likely of `z`, at most STARTS, and their log-likelihoods, the likeliest first.
 
-    Two candidates are merged if the robots' positions differ by less than MERGED_WITHIN R, unless the
+    Two guesses are merged if the robots' positions differ by less than MERGED_WITHIN R, unless the
     likelihood falls between them.
     """
     likely, gap = _likelihood(z, sigma, residuals_at, pair)

@@ -149,7 +149,7 @@ def copied(folder: Path, there: Path) -> Path:
 
 
 @pytest.mark.parametrize(("name", "simulation"), [("paper-1", 0), ("paper-2", 1)])
-def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
+def test_a_plan_shows_each_hypothesis_and_the_axis_of_each_two_and_the_choice(
     name: str, simulation: int, recordings: Path
 ) -> None:
     told, computed = pair(recorded(name, recordings)), REFERENCE.sims[simulation]
@@ -157,16 +157,16 @@ def test_a_plan_shows_each_candidate_and_the_axis_of_each_two_and_the_choice(
     final_report = told.run.final_reports["b"]
     assert final_report.candidates is not None
     count = final_report.candidates[1]
-    assert len(found(figure, r"candidate-\d+")) == count == len(computed.d_i)
+    assert len(found(figure, r"hypothesis-\d+")) == count == len(computed.d_i)
     assert len(found(figure, r"bisector-\d+-\d+")) == count * (count - 1) // 2
-    places = [line(figure, f"candidate-{i + 1}")[0] for i in range(count)]
+    places = [line(figure, f"hypothesis-{i + 1}")[0] for i in range(count)]
     start, end = line(figure, "chosen-ends")
     rho = told.mutual[computed.k_second][1]
     assert radii(figure, "rho") == [rho]
     assert [math.dist(start, place) for place in places] == pytest.approx([rho] * count)
     away = [math.dist(end, place) for place in places]
     assert sorted(away) == pytest.approx(sorted(computed.d_i), abs=1e-6)
-    labels = [one.get_label() for i in range(count) for one in found(figure, f"candidate-{i + 1}")]
+    labels = [one.get_label() for i in range(count) for one in found(figure, f"hypothesis-{i + 1}")]
     assert labels == [f"{i}: predicted range {far:.4f} m" for i, far in enumerate(away, start=1)]
     for i, j in combinations(range(count), 2):
         for point in line(figure, f"bisector-{i + 1}-{j + 1}"):
@@ -196,7 +196,7 @@ def test_what_is_compared_is_what_was_chosen_from(recordings: Path) -> None:
 
 
 def test_a_plan_of_a_is_seen_from_a(recordings: Path) -> None:
-    """The distances are symmetric: b's candidates around a, and a's around b."""
+    """The distances are symmetric: b's hypotheses around a, and a's around b."""
     told = pair(recorded("paper-1", recordings))
     ((_, plan),) = manoeuvre.planned(told, "b")
     turned = manoeuvre.scene(plan._replace(question=plan.question._replace(mover="a")))
@@ -359,7 +359,7 @@ def test_a_noisy_plan_of_the_paper_planner_is_drawn_in_bs_frame(recordings: Path
     told = pair(recorded("letter", recordings))
     ((_, plan),) = manoeuvre.planned(told, "b")
     (figure,) = [drawn(one) for one in manoeuvre.draw(told).values()]
-    assert len(found(figure, r"candidate-\d+")) == len(plan.question.candidates)
+    assert len(found(figure, r"hypothesis-\d+")) == len(plan.question.placements)
     assert any("in b's own frame" in text.get_text() for text in figure.texts)
 
 

@@ -352,13 +352,13 @@ def test_driving_back_is_never_slower_than_circling_for_a_slow_turner(
 # --- the last manoeuvre -------------------------------------------------------------------------------
 
 
-def left_out(state: RobotState, v: float, omega: float, candidates: tuple[Placement, ...]) -> list[Placement]:
-    """Return the candidates by which a is out of range of b after b drives (v, omega) for a tick."""
+def left_out(state: RobotState, v: float, omega: float, placements: tuple[Placement, ...]) -> list[Placement]:
+    """Return the placements by which a is out of range of b after b drives (v, omega) for a tick."""
     mission = state.config.mission
     end = step(state.local_pose, v, omega, mission.period)
     a = state.pair_observations(state.tick)[-1].a
     rim = mission.sensing_range - 1e-6
-    return [one for one in candidates if math.hypot(one.place(a).x - end.x, one.place(a).y - end.y) > rim]
+    return [one for one in placements if math.hypot(one.place(a).x - end.x, one.place(a).y - end.y) > rim]
 
 
 def grid(mission: Mission) -> Iterator[tuple[float, float]]:
@@ -376,10 +376,10 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
             if isinstance(state.task, LastManoeuvre) and not isinstance(
                 moment.before["b"].task, LastManoeuvre
             ):
-                candidates = state.belief.placements
+                placements = state.belief.placements
                 command = moment.commands["b"]
-                out = len(left_out(state, command.v, command.omega, candidates))
-                assert out <= min(len(left_out(state, *one, candidates)) for one in grid(SLOW.mission)), seed
+                out = len(left_out(state, command.v, command.omega, placements))
+                assert out <= min(len(left_out(state, *one, placements)) for one in grid(SLOW.mission)), seed
                 assert out <= 1
                 counts.add(out)
     assert counts == {0, 1}

@@ -205,15 +205,15 @@ def test_a_robot_released_on_its_anchor_knows_its_branch_at_once() -> None:
     assert outcome(recording) == "localised"
 
 
-def test_a_single_candidate_is_checked_before_it_is_claimed() -> None:
+def test_a_single_hypothesis_is_checked_before_it_is_claimed() -> None:
     """Two mutual ranges and D have no redundancy, so b makes a manoeuvre even with one placement left."""
     second = next(step for step in steps("paper-1") if step.commands["b"].task == "last-manoeuvre")
     state, heard = second.observed["b"], second.heard["b"]
     possible = planner_of(state).decide(state, heard).belief.placements
     assert len(possible) == 4
     for placement in possible:
-        findings = replace(state.belief, placements=(placement,), candidates=(4, 1))
-        decided = planner_of(state).decide(replace(state, belief=findings), heard)
+        posterior = replace(state.belief, placements=(placement,), hypothesis_counts=(4, 1))
+        decided = planner_of(state).decide(replace(state, belief=posterior), heard)
         assert decided.verdict is None
         assert planner_of(decided).command(decided).v == 1.0
 
@@ -269,10 +269,10 @@ def test_the_last_manoeuvre_of_the_paper_planner_maximises_eq_8_at_full_speed(
 
 @settings(max_examples=8)
 @given(last_points())
-def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
+def test_the_assured_last_manoeuvre_keeps_as_many_hypotheses_in_range_as_it_can(
     case: tuple[Pose, Pose, list[Placement]],
 ) -> None:
-    """Among manoeuvres with as many candidates in range, it is the optimum of eq. (8)."""
+    """Among manoeuvres with as many hypotheses in range, it is the optimum of eq. (8)."""
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
     plan = last_manoeuvre(Question("b", a, b, tuple(found)), SECTION_IV, Assured.MANOEUVRES)
@@ -289,7 +289,7 @@ def test_the_assured_last_manoeuvre_keeps_as_many_candidates_in_range_as_it_can(
     assert plan.separation_m2 == pytest.approx(best, abs=1e-9)
 
 
-def test_a_single_candidate_is_checked_from_where_its_range_changes_most() -> None:
+def test_a_single_hypothesis_is_checked_from_where_its_range_changes_most() -> None:
     b, a = Pose(0.0, 0.0, 0.0), Pose(6.5, 0.0, 0.0)
     ahead = Placement(0.0, -4.5, 0.0)
     plan = last_manoeuvre(Question("b", a, b, (ahead,)), SECTION_IV, Assured.MANOEUVRES)

@@ -244,7 +244,7 @@ def test_each_range_is_weighed_by_the_prediction_from_all_others() -> None:
 
 
 def test_the_estimator_without_memory_raises_memory_error() -> None:
-    """No machine has the memory for these numbers of ranges, candidates and ticks."""
+    """No machine has the memory for these numbers of ranges, guesses and ticks."""
     many, none = 1 << 50, address(np.zeros(0))
     problem = problem_of(1, 1, 4, slow=0.0, survey=0.0, prior=False)
     poses, constants, white = point_of(problem.measured, 1)

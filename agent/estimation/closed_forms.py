@@ -95,9 +95,9 @@ def placements(
         radius = math.hypot(anchor_x, anchor_y)
         for tx, ty in circle_intersections(p1b.x, p1b.y, radius, distance):
             spin = math.atan2(ty - p1b.y, tx - p1b.x) - math.atan2(anchor_y, anchor_x)
-            candidate = Placement(wrap(turn + spin), tx, ty)
-            if not any(same_placement(candidate, other, SAME_PLACEMENT) for other in solutions):
-                solutions.append(candidate)
+            solution = Placement(wrap(turn + spin), tx, ty)
+            if not any(same_placement(solution, other, SAME_PLACEMENT) for other in solutions):
+                solutions.append(solution)
     return solutions
 
 

@@ -76,11 +76,10 @@ class Estimator(Protocol):
     def on_anchor(self, knowledge: Knowledge, rho0: float) -> AnchorEstimate | None:
         """Return the estimate of a robot that starts on its anchor; None if `rho0` (m) does not say so."""
 
-    def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
+    def anchor(self, knowledge: Knowledge, allowed: tuple[Branch, ...]) -> AnchorEstimate:
         """Return the branches that the anchor ranges allow.
 
-        `candidates` contains the branches that the ranges before the last one allowed; it is empty at the
-        second range.
+        `allowed` are the branches that the ranges before the last one allowed; empty at the second range.
         """
 
     def pair(self, knowledge: Knowledge, first_tick: int, *, second_range: bool) -> PairEstimate | None:

@@ -1,7 +1,7 @@
 """Estimation with exact sensors: the possible branches in phase 1, and the possible placements in phase 3.
 
-Closed forms yield the candidates, and all measurements test them. The sensors are exact, so the test has a
-fixed tolerance in m, the floor of `protocol.rounding`. A candidate that passes is refined by Gauss-Newton.
+Closed forms yield the solutions, and all measurements test them. The sensors are exact, so the test has a
+fixed tolerance in m, the floor of `protocol.rounding`. A solution that passes is refined by Gauss-Newton.
 This changes nothing where the closed form is well conditioned, and restores the digits that are lost next to
 a double root.
 """
@@ -68,13 +68,13 @@ def branches(rho0: float, measured_at: Pose, rho: float) -> tuple[Branch, ...]:
 
 
 def weigh_branches(
-    candidates: Iterable[Branch],
+    solutions: Iterable[Branch],
     seen: Iterable[tuple[Pose, float | None]],
     sensing_range: float,
     floor: float,
     margin: float,
 ) -> tuple[Branch, ...]:
-    """Return those of `candidates` that are consistent with every pose in `seen`, ranged or not detected.
+    """Return those of `solutions` that are consistent with every pose in `seen`, ranged or not detected.
 
     `floor` is the largest error (m) of a predicted range from rounding. `margin` is how far (m) inside R a
     point must be for a detection to be certain. Half of it is reserved for the error of a heading from two
@@ -91,8 +91,8 @@ def weigh_branches(
         else:
             ranged.append((pose, rho))
     left: list[Branch] = []
-    for candidate in candidates:
-        branch = polished(candidate, ranged)
+    for solution in solutions:
+        branch = polished(solution, ranged)
         frame = Placement(branch.start.heading, branch.start.x, branch.start.y)
         if (
             _branch_meets(branch, ranged, floor)
@@ -175,12 +175,12 @@ Positions = tuple[float, float, float, float]
 
 
 def weigh_placements(
-    candidates: Iterable[Placement],
+    solutions: Iterable[Placement],
     pair_observations: Sequence[PairObservation],
     sensing_range: float,
     floor: float,
 ) -> tuple[Placement, ...]:
-    """Return those of `candidates` that are consistent with every observation, ranged or not detected.
+    """Return those of `solutions` that are consistent with every observation, ranged or not detected.
 
     `floor` is the largest error (m) of a predicted range from rounding, that of phase 1 included.
     """
@@ -193,8 +193,8 @@ def weigh_placements(
             undetected.append((a.x, a.y, b.x, b.y))
         else:
             ranged.append(((a.x, a.y, b.x, b.y), rho))
-    for candidate in candidates:
-        placement = _polished_placement(candidate, ranged) if len(ranged) > 2 else candidate
+    for solution in solutions:
+        placement = _polished_placement(solution, ranged) if len(ranged) > 2 else solution
         same = same_turn(math.hypot(placement.x, placement.y) + sensing_range)
         if (
             _explains_ranges(placement, ranged, floor)

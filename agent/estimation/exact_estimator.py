@@ -30,7 +30,7 @@ Eq. (7) then determines a's rotation about M1 no better than 1e-16 divided by th
 
 
 class ExactEstimator(msgspec.Struct, frozen=True):
-    """The closed forms of Section III. A candidate that contradicts any measurement is ruled out."""
+    """The closed forms of Section III. A solution that contradicts any measurement is ruled out."""
 
     pose_tolerance: ClassVar[float] = 1e-9
     """The rounding error of the odometry, in rad and in units of A_0."""
@@ -58,17 +58,17 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         branch = Branch(0.0, ORIGIN)
         return AnchorEstimate(knowledge.own_anchor, (branch,), 0.0, branch, accuracy.error, accuracy.enough)
 
-    def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
+    def anchor(self, knowledge: Knowledge, allowed: tuple[Branch, ...]) -> AnchorEstimate:
         """Return the branches +alpha and -alpha of eq. (2) that agree with every tick of phase 1."""
         known = knowledge.own_anchor
-        if not candidates:
+        if not allowed:
             ranges = knowledge.log.ranges
-            candidates = branches(ranges[0].range, knowledge.odometry, ranges[-1].range)
-            known = replace(known, possible=candidates)
+            allowed = branches(ranges[0].range, knowledge.odometry, ranges[-1].range)
+            known = replace(known, possible=allowed)
         mission = knowledge.config.mission
         floor = precision.range_rounding(knowledge, knowledge.log, knowledge.tick)
         margin = precision.margin(mission, floor)
-        remaining = weigh_branches(candidates, knowledge.seen(), mission.sensing_range, floor, margin)
+        remaining = weigh_branches(allowed, knowledge.seen(), mission.sensing_range, floor, margin)
         remaining = precision.merged(knowledge, remaining)
         if len(remaining) != 1:
             return AnchorEstimate(known, remaining, margin)
@@ -127,17 +127,17 @@ def _with_placements(
     bound in m on the error of a predicted range.
     """
     reach, solutions = knowledge.config.mission.sensing_range, belief.placements
-    candidates = belief.candidates
-    if candidates is None:
+    counts = belief.hypothesis_counts
+    if counts is None:
         (first, second), distance = pair_base, knowledge.config.anchor_distance
         assert first.range is not None
         assert second.range is not None
         solutions = tuple(placements(distance, first.b, first.a, second.a, first.range, second.range))
         undetected = [at for at in observations if at.range is None]
         possible = weigh_placements(solutions, undetected, reach, floor)
-        candidates = (len(solutions), len(possible))
+        counts = (len(solutions), len(possible))
     remaining = weigh_placements(solutions, observations, reach, floor)
-    return replace(belief, placements=remaining, candidates=candidates, observations=tuple(observations))
+    return replace(belief, placements=remaining, hypothesis_counts=counts, observations=tuple(observations))
 
 
 def base(

@@ -25,9 +25,9 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import (
     FEWEST_DECISIVE,
     begun,
-    candidates,
     extended,
     from_nothing,
+    locatable,
     search,
 )
 from agent.estimation.judged import Judged, User, misfit, of_joint
@@ -166,7 +166,7 @@ class Following(NamedTuple):
 
     def _extended(self, found: Posterior, used: JointMeasurements) -> Following:
         """Return `found` with further robots; those that failed are tried again with more ranges."""
-        names, possible = used.robots, candidates(found.located, used)
+        names, possible = used.robots, locatable(found.located, used)
         tried = {one: self.failed.get(tuple([names[k] for k in one.robots]), 0) for one in possible}
         left = [one for one in possible if one.decisive < MORE_RANGES * tried[one]]
         if len(left) == len(possible):
@@ -174,7 +174,7 @@ class Following(NamedTuple):
         anew = not left and found.located == used.started
         more = from_nothing(used, FEWEST_DECISIVE) if anew else extended(found, used, left)
         failed = dict(self.failed)
-        for one in candidates(more.located, used):
+        for one in locatable(more.located, used):
             if one not in left:
                 failed[tuple([names[k] for k in one.robots])] = one.decisive
         return self._replace(known=more, failed=failed)

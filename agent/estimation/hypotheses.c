@@ -303,7 +303,7 @@ typedef struct {
     const double *rho, *apart, *lever;
 } Meeting;
 
-/* A candidate with what follows from it. */
+/* A guess with what follows from it. */
 typedef struct {
     double z[UNKNOWNS], likely, gap[2];
     Index number;
@@ -457,7 +457,7 @@ typedef struct {
     double at, rotations, radius, squared, offset[3], rho_squared;
 } Circle;
 
-/* Set `to` to the candidates of a circle, two for each of the rotations; returns their end. */
+/* Set `to` to the guesses of a circle, two for each of the rotations; returns their end. */
 static Placed *scanned(const Meeting *of, const Circle *circle, Placed *to)
 {
     const Index j = (Index)circle->at;
@@ -478,18 +478,18 @@ static Placed *scanned(const Meeting *of, const Circle *circle, Placed *to)
     return to;
 }
 
-/* Set `found` to the likeliest placements by the `candidates` of all `circles`, with their log-likelihoods as a last
+/* Set `found` to the likeliest placements by the `guesses` of all `circles`, with their log-likelihoods as a last
    column; returns their number, at most `most`, or -1 if a matrix is singular, or -2 without memory. `finer` are the
-   errors (m) of the candidates before each of the `steps`, and at the end, and `damping` those of the rotations. */
+   errors (m) of the guesses before each of the `steps`, and at the end, and `damping` those of the rotations. */
 Index placements(Index count, Index middle, const double *near_x, const double *near_y, const double *near_root,
                  const double *far_x, const double *far_y, const double *far_root, const double *rho,
                  const double *sigma, const Mixture *by, const double *apart, const double *lever, Index circles,
-                 const Circle *circle, Index candidates, Index steps, const double *finer, const double *damping,
+                 const Circle *circle, Index guesses, Index steps, const double *finer, const double *damping,
                  double largest, double cell, Index crowd, double unlikely, double near, double ridge, Index most,
                  double *found)
 {
     const Meeting of = {count, middle, {{near_x, near_y, near_root}, {far_x, far_y, far_root}}, rho, apart, lever};
-    Placed *all = malloc(sizeof *all * candidates), *end = all;
+    Placed *all = malloc(sizeof *all * guesses), *end = all;
     double *work = malloc(sizeof(double) * count * (UNKNOWNS + 4)), *logs = work + count * (UNKNOWNS + 1);
     Index (*cells)[4] = malloc(sizeof *cells * crowd);
     Spread spread = {count, by, logs, logs + count, logs + 2 * count};
@@ -497,7 +497,7 @@ Index placements(Index count, Index middle, const double *near_x, const double *
     for (Index k = 0; k < circles; k++) end = scanned(&of, circle + k, end);
     Index left = end - all;
     for (Index step = 0; step < steps; step++) {
-        const int crowded = left > crowd; /* of many candidates, only the rotations */
+        const int crowded = left > crowd; /* of many guesses, only the rotations */
         widen(&spread, sigma, finer[step]);
         for (Index n = 0; n < left; n++)
             if (!(crowded ? turn(&of, &spread, 2, damping[step], largest, all[n].z, work)

@@ -67,8 +67,8 @@ class Belief(msgspec.Struct, frozen=True):
     """The tick in which phase 3 began."""
     placements: tuple[Placement, ...] = ()
     """The solutions of eq. (7) that no measurement has ruled out."""
-    candidates: tuple[int, int] | None = None
-    """The number of candidates at the beginning, and after their evaluation.
+    hypothesis_counts: tuple[int, int] | None = None
+    """The number of hypotheses at the beginning, and after their evaluation.
 
     Exact sensors: the solutions of eq. (7), and those that agree with the ticks without detection. Noisy
     sensors: the hypotheses of the first search, and the present ones.

@@ -311,10 +311,12 @@ class LogPlanner(Planner[RobotState, Report]):
             anchor_ranges=len(state.log.ranges),
             branch=own.kind,
             alpha=own.branch.alpha if own.branch is not None else None,
-            candidates=belief.candidates,
+            candidates=belief.hypothesis_counts,
             last_turn_rate=plan.command.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,
-            hypotheses=(len(belief.pair or belief.placements) if belief.candidates is not None else None),
+            hypotheses=(
+                len(belief.pair or belief.placements) if belief.hypothesis_counts is not None else None
+            ),
             probability=belief.pair[0].probability if belief.pair else None,
             blocking_reason=belief.blocking_reason,
             p_value=belief.attempt.p_value,

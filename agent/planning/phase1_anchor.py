@@ -25,7 +25,7 @@ from protocol.mission import RANGE_MARGIN, Mission, third_point_turn_rate
 from protocol.motion import Controls, Pose, chord, compose, rotated_back
 
 PREFERENCE = 1e-9
-"""The relative improvement, above rounding errors, that a later candidate needs to replace an earlier one."""
+"""The relative improvement, above rounding errors, that a later manoeuvre needs to replace an earlier one."""
 
 SHORTEST_MANOEUVRE = 1e-9
 """The length of a manoeuvre, relative to A_0, up to which it counts as none."""
@@ -161,15 +161,15 @@ def _with_branches(state: RobotState) -> tuple[RobotState, AnchorEstimate, Branc
     The last is None if a further range has to check it. A third range that is missing is the paper's virtual
     measurement.
     """
-    candidates: tuple[Branch, ...] = ()
+    allowed: tuple[Branch, ...] = ()
     kind: BranchKind | None = None
     match state.task:
-        case tasks.ThirdPoint(candidates):
+        case tasks.ThirdPoint(allowed):
             measured = state.log.ranges[-1].tick == state.tick
             kind = "three-ranges" if measured else "three-ranges-virtual"
         case tasks.Circling():
             kind = "circle"
-    estimate = state.estimator.anchor(state, candidates)
+    estimate = state.estimator.anchor(state, allowed)
     return replace(state, own_anchor=estimate.known), estimate, kind
 
 

@@ -40,7 +40,7 @@ would not increase the determinant.
 
 
 class Question(NamedTuple):
-    """The problem that the last manoeuvre solves: which of `candidates` is the true placement."""
+    """The problem that the last manoeuvre solves: which of `placements` is the true one."""
 
     mover: Role
     """The robot that moves, in the paper always b."""
@@ -48,7 +48,7 @@ class Question(NamedTuple):
     """The pose of a in <a(M1)>."""
     b: Pose
     """The pose of b in <b(M2)>."""
-    candidates: tuple[Placement, ...]
+    placements: tuple[Placement, ...]
 
 
 class Plan(NamedTuple):
@@ -56,7 +56,7 @@ class Plan(NamedTuple):
 
     command: Controls
     separation_m2: float | None
-    """J of eq. (8) in m^2: the smallest difference of predicted squared ranges; None for one candidate."""
+    """J of eq. (8) in m^2: the smallest difference of predicted squared ranges; None for one placement."""
     question: Question
 
 
@@ -77,7 +77,7 @@ class Compared(NamedTuple):
 
     reach: ReachableEnds
     gap: Array
-    """J in m^2, (S, W). For one candidate: the decrease of the squared range."""
+    """J in m^2, (S, W). For one placement: the decrease of the squared range."""
     value: Array
     """`gap` of the manoeuvres that are allowed, and -inf for the others; (S, W)."""
 
@@ -93,33 +93,33 @@ def turn(pair_observations: Sequence[PairObservation]) -> Role:
 
 
 def last_manoeuvre(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Plan | None:
-    """Return the manoeuvre that best distinguishes the candidates by the range after it (eq. (8)).
+    """Return the manoeuvre that best distinguishes the placements by the range after it (eq. (8)).
 
     It maximises the smallest difference of the predicted ranges, in squares. The maximum is found by
     enumeration of `manoeuvres`.
 
-    With one candidate, the manoeuvre is a check: it approaches the candidate so that the squared range
+    With one placement, the manoeuvre is a check: it approaches the other robot so that the squared range
     decreases most, since no detection would check nothing. The result is None if every manoeuvre violates the
     safety distance.
     """
     reach, gap, value = compared(question, mission, manoeuvres)
-    return _plan(question, reach, value, gap if len(question.candidates) > 1 else None)
+    return _plan(question, reach, value, gap if len(question.placements) > 1 else None)
 
 
 def compared(question: Question, mission: Mission, manoeuvres: Manoeuvres) -> Compared:
     """Return all manoeuvres with their values. `last_manoeuvre` takes the largest value."""
-    mover, a, b, candidates = question
+    mover, a, b, placements = question
     reach = reachable(a if mover == "a" else b, mission, manoeuvres.last_speeds)
     squared: list[Array] = []
-    for candidate in candidates:
-        (ax, ay), (bx, by) = _positions_in_b(mover, a, b, candidate, reach.x, reach.y)
+    for placement in placements:
+        (ax, ay), (bx, by) = _positions_in_b(mover, a, b, placement, reach.x, reach.y)
         dx, dy = np.subtract(ax, bx), np.subtract(ay, by)
         dx *= dx
         dy *= dy
         dx += dy
         squared.append(dx)
     if len(squared) == 1:
-        gap = travelled(b, candidates[0].place(a)) ** 2 - squared[0]
+        gap = travelled(b, placements[0].place(a)) ** 2 - squared[0]
     else:
         gap = reduce(np.minimum, [_gap(one, other) for i, one in enumerate(squared) for other in squared[:i]])
     value, apart = gap, None
@@ -167,11 +167,11 @@ def most_informative_manoeuvre(
 
 
 def _keeps_apart(question: Question, reach: ReachableEnds, mission: Mission) -> NDArray[np.bool]:
-    """Return which manoeuvres keep the safety distance for every candidate; (S, W)."""
-    mover, a, b, candidates = question
+    """Return which manoeuvres keep the safety distance by every placement; (S, W)."""
+    mover, a, b, placements = question
     v, omega = np.broadcast_arrays(reach.v, reach.omega)
     here = a if mover == "a" else b
-    others = [one.place(a) if mover == "b" else relative(one.frame, b) for one in candidates]
+    others = [one.place(a) if mover == "b" else relative(one.frame, b) for one in placements]
     least = [nearest(here, v, omega, (other.x, other.y), mission.period) for other in others]
     allowed: NDArray[np.bool] = np.min(least, axis=0) >= mission.safety_distance
     return allowed

@@ -52,10 +52,10 @@ class Resected(msgspec.Struct, frozen=True):
     """The tick after which its ranges count."""
     places: Mapping[tuple[str, int], RangedPlace] = {}
     """The ranges to robots that have reported their poses in those ticks, by robot and tick."""
-    possible: tuple[Pose, ...] = ()
+    hypotheses: tuple[Pose, ...] = ()
     """The poses of `base` in <W> that agree with the ranges; empty before the heading can be determined."""
-    candidates: Mapping[str, Pose] = {}
-    """The pose in <W> of the frame of the odometry, by the robot from whose reports it follows."""
+    unconfirmed: Mapping[str, Pose] = {}
+    """The only hypothesis that the reports of each robot leave: the pose in <W> of the odometry's frame."""
 
     def told(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
@@ -63,7 +63,7 @@ class Resected(msgspec.Struct, frozen=True):
         if not isinstance(state.task, Looping):  # a robot that comes back may have corrected its pose
             places = {key: report for key, report in places.items() if key[1] > state.tick - LOOPS_FOR}
         for report in reports:
-            if (prior := report.prior) is None or report.robot in self.candidates:
+            if (prior := report.prior) is None or report.robot in self.unconfirmed:
                 continue
             key = report.robot, prior.tick
             if key in places or prior.tick <= max(self.since, state.tick - KEPT):
@@ -81,28 +81,28 @@ class Resected(msgspec.Struct, frozen=True):
         """Return `report` to `peer`: a robot by which it knows a pose does not stop any longer."""
         return (
             replace(report, state=UNCONFIRMED)
-            if report.verdict is None and peer in self.candidates
+            if report.verdict is None and peer in self.unconfirmed
             else report
         )
 
     def why_undecided(self, state: RobotState) -> str:
         """Return why the robot has not claimed a pose, for a user."""
-        if not self.candidates:
+        if not self.unconfirmed:
             return "no localised robot has found it"
-        finders = ", ".join(sorted(self.candidates))
+        finders = ", ".join(sorted(self.unconfirmed))
         return f"{state.config.tolerates + 1} robots must agree on its pose; it is found by: {finders}"
 
     def estimate(self, state: RobotState, of_tick: Estimate) -> Estimate:
         """Return `of_tick` with the poses that agree with all ranges, or are not confirmed yet."""
-        world = [_now(state, self, one) for one in self.possible]
+        world = [_now(state, self, one) for one in self.hypotheses]
         if not world:
-            world = [compose(self.candidates[robot], state.odometry) for robot in sorted(self.candidates)]
+            world = [compose(self.unconfirmed[robot], state.odometry) for robot in sorted(self.unconfirmed)]
         return replace(of_tick, world=tuple(world))
 
     def summary(self, state: RobotState) -> Summary:
         """Return the number of hypotheses."""
         del state
-        return Summary(hypotheses=len(self.possible) or len(self.candidates) or None)
+        return Summary(hypotheses=len(self.hypotheses) or len(self.unconfirmed) or None)
 
 
 def _moved(state: RobotState, base: Pose, tick: int) -> Pose:
@@ -119,7 +119,7 @@ def _now(state: RobotState, found: Resected, base: Pose) -> Pose:
 
 def _resected(state: RobotState, found: Resected) -> tuple[RobotState, Resected]:
     """Return both with what follows from the ranges to each robot: a square to drive, or a verdict."""
-    for robot in sorted({robot for robot, _ in found.places} - found.candidates.keys()):
+    for robot in sorted({robot for robot, _ in found.places} - found.unconfirmed.keys()):
         ranged = [found.places[key] for key in sorted(found.places) if key[0] == robot]
         standing = [one for one in ranged if one.odometry == ORIGIN]
         moved = [one for one in ranged if one.odometry != ORIGIN]
@@ -127,23 +127,23 @@ def _resected(state: RobotState, found: Resected) -> tuple[RobotState, Resected]
             positions = resection.positions(standing, LARGEST_MISFIT)
             if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
                 return state.doing(sweep.looping(state, state.tick)), found
-        elif moved and (possible := resection.poses(standing, moved, LARGEST_MISFIT)):
-            found = replace(found, possible=possible)
-            if resection.is_certain(standing, moved, possible):
-                state, found = _with_candidate(state, found, robot)
+        elif moved and (hypotheses := resection.poses(standing, moved, LARGEST_MISFIT)):
+            found = replace(found, hypotheses=hypotheses)
+            if resection.is_certain(standing, moved, hypotheses):
+                state, found = _with_unconfirmed(state, found, robot)
                 if state.verdict is not None:
                     break
     return state, found
 
 
-def _with_candidate(state: RobotState, found: Resected, robot: str) -> tuple[RobotState, Resected]:
-    """Return both with the first hypothesis, which follows from the reports of `robot`.
+def _with_unconfirmed(state: RobotState, found: Resected, robot: str) -> tuple[RobotState, Resected]:
+    """Return both with the only hypothesis that the reports of `robot` leave.
 
     It is claimed if as many robots agree on it as are needed for one of them to be honest.
     """
-    pose = _now(state, found, found.possible[0])
-    others = [compose(one, state.odometry) for by, one in found.candidates.items() if by != robot]
-    found = replace(found, candidates={**found.candidates, robot: compose(pose, inverse(state.odometry))})
+    pose = _now(state, found, found.hypotheses[0])
+    others = [compose(one, state.odometry) for by, one in found.unconfirmed.items() if by != robot]
+    found = replace(found, unconfirmed={**found.unconfirmed, robot: compose(pose, inverse(state.odometry))})
     if 1 + sum([_agree(pose, other) for other in others]) > state.config.tolerates:
         state = state.doing(Done(3, Localised(pose))).with_frame(pose)
     return state, found
@@ -162,12 +162,12 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     still again, and forgets all ranges: those to the next robot that comes begin where it is then.
     """
     if not isinstance(state.task, Looping):
-        return state.doing(Standing() if found.places or found.candidates else Awaiting())
+        return state.doing(Standing() if found.places or found.unconfirmed else Awaiting())
     task = sweep.onward(state, state.task)
     if task.places:
         return state.doing(task)
-    latest = max([tick for robot, tick in found.places if robot not in found.candidates], default=-KEPT)
+    latest = max([tick for robot, tick in found.places if robot not in found.unconfirmed], default=-KEPT)
     if latest > state.tick - KEPT and state.task.since > state.tick - LOOPS_FOR:
         return state.doing(sweep.looping(state, state.task.since))
-    found = Resected(state.odometry, state.tick, candidates=found.candidates)
-    return state.doing(Standing() if found.candidates else Awaiting()).with_agenda(found=found)
+    found = Resected(state.odometry, state.tick, unconfirmed=found.unconfirmed)
+    return state.doing(Standing() if found.unconfirmed else Awaiting()).with_agenda(found=found)

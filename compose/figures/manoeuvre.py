@@ -70,11 +70,11 @@ class ManoeuvreView(NamedTuple):
 
 def scene(plan: Plan) -> ManoeuvreView:
     """Return the view of `plan`."""
-    mover, a, b, candidates = plan.question
+    mover, a, b, placements = plan.question
     own, other = (a, b) if mover == "a" else (b, a)
     spin = -math.atan2(own.y, own.x)
     frame = Pose(0.0, 0.0, spin)
-    places = [compose(inverse(one.frame) if mover == "a" else one.frame, other) for one in candidates]
+    places = [compose(inverse(one.frame) if mover == "a" else one.frame, other) for one in placements]
     return ManoeuvreView(compose(frame, own), tuple([compose(frame, place) for place in places]), spin)
 
 
@@ -87,7 +87,7 @@ def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     axes, value = sheet.panels["plane"], sheet.panels["value"]
     away = [travelled(seen.mover, other) for other in seen.others]
     half = WINDOW_MARGIN * max(mission.max_speed * mission.period, *away)
-    _candidates(axes, pair, one, seen, half)
+    _hypotheses(axes, pair, one, seen, half)
     _reach(axes, pair, plan, seen, ways)
     x, y = seen.mover.x, seen.mover.y
     sheet.plane("plane", (x - half, x + half, y - half, y + half))
@@ -104,13 +104,13 @@ def _title(pair: PairRecord, one: Planned) -> str:
     robot, own = pair.robot(mover).id, plan.question.a == ORIGIN == plan.question.b
     frame = f"{robot}'s own frame" if own else rf"$\langle\,{mover}({ANCHORS[mover]})\rangle$"
     chosen = rf"$v_2$ = {plan.command.v:g} m/s, $\omega_2$ = {plan.command.omega:+.4f} rad/s"
-    count = len(plan.question.candidates)
-    candidates = f"{count} hypotheses" if count > 1 else "1 hypothesis, to be checked"
+    count = len(plan.question.placements)
+    hypotheses = f"{count} hypotheses" if count > 1 else "1 hypothesis, to be checked"
     value = f", $J$ = {plan.separation_m2:.5g} m$^2$" if plan.separation_m2 is not None else ""
-    return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {candidates}; {chosen}{value}"
+    return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {hypotheses}; {chosen}{value}"
 
 
-def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
+def _hypotheses(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
     """Draw where each hypothesis has the other robot, the last range, and the bisectors of all pairs."""
     other, x, y = OTHER[one.plan.question.mover], seen.mover.x, seen.mover.y
     for (i, p), (j, q) in combinations(enumerate(seen.others, start=1), 2):
@@ -134,7 +134,7 @@ def _candidates(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
         away = travelled(seen.mover, place) or 1.0
         trace(
             axes, [place], ROLE_MARKERS[other]["marker"], ms=7, mfc=COLOURS[other], mec="white", mew=0.6,
-            gid=f"candidate-{i}", zorder=5, label=f"{i}: predicted range {travelled(end, place):.4f} m",
+            gid=f"hypothesis-{i}", zorder=5, label=f"{i}: predicted range {travelled(end, place):.4f} m",
         )  # fmt: skip
         beside = -13 * (place.x - x) / away, -13 * (place.y - y) / away
         axes.annotate(str(i), (place.x, place.y), xytext=beside, **text)

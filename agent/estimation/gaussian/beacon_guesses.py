@@ -23,19 +23,19 @@ ROTATIONS = 72
 """The number of rotations that are tried. The refinement bridges half of the 5 degrees between them."""
 
 REFINEMENTS = 8
-"""The number of Gauss-Newton steps on all candidates."""
+"""The number of Gauss-Newton steps on all guesses."""
 
 COARSE = 0.1
-"""The expected error of a candidate's ranges at first, as a fraction of the longest range."""
+"""The expected error of a guess's ranges at first, as a fraction of the longest range."""
 
 ERROR_FINER = 0.4
 """The factor by which it decreases in each step."""
 
-CANDIDATES = 8
-"""The number of candidates from which fits begin."""
+MOST_DISTINCT = 8
+"""The largest number of distinct guesses, from which fits begin."""
 
 APART, TURNED = 0.05, 0.2
-"""The distance (as a fraction of the longest range) and the angle (rad) within which candidates are one."""
+"""The distance (as a fraction of the longest range) and the angle (rad) within which guesses are one."""
 
 FEWEST_FOR_POSE = 4
 """The least number of ranges for hypotheses: there are three unknowns, and one range checks them."""
@@ -171,7 +171,7 @@ def _distinct(guesses: Array, likely: Array, at: Array, longest: float) -> list[
     ends = np.stack(rotated(c, s, x, y), 1)
     left: Places = np.argsort(-likely, kind="stable")
     chosen: list[Array] = []
-    while len(left) and len(chosen) < CANDIDATES:
+    while len(left) and len(chosen) < MOST_DISTINCT:
         best = int(left[0])
         chosen.append(guesses[best])
         turn = np.remainder(guesses[left, 2] - guesses[best, 2] + math.pi, math.tau) - math.pi

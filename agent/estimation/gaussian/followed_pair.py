@@ -61,7 +61,7 @@ def followed(knowledge: Knowledge) -> FollowedPair:
     first = beginning(knowledge, knowledge.known_through)
     measured, belief = pair_of(knowledge), knowledge.belief
     if first != belief.attempt.beginning:
-        belief = replace(belief, pair=(), candidates=None, attempt=Attempt(first))
+        belief = replace(belief, pair=(), hypothesis_counts=None, attempt=Attempt(first))
         knowledge = replace(knowledge, belief=belief)
     mutual = int(np.count_nonzero(measured.ranges.mutual))
     if mutual < FEWEST_FOR_CLAIM:
@@ -96,14 +96,14 @@ def believed(
     if judged is not None and user == "assured" and not isinstance(knowledge.peer_state.verdict, Localised):
         judged = judged._replace(rivals_of=(0, 1))
     blocking = blocked(judged, conditions)
-    first, _ = knowledge.belief.candidates or (len(scored), 0)
+    first, _ = knowledge.belief.hypothesis_counts or (len(scored), 0)
     belief = replace(
         knowledge.belief,
         pair=scored,
         poses=tuple([one.pose for one in claims]),
         odometry=knowledge.odometry,
         covariance=claims[0].covariance if claims else None,
-        candidates=(first, len(scored)),
+        hypothesis_counts=(first, len(scored)),
         blocking_reason=blocking and blocking.reason,
     )
     return belief, judged, blocking

@@ -48,9 +48,9 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         del knowledge, rho0
         return None
 
-    def anchor(self, knowledge: Knowledge, candidates: tuple[Branch, ...]) -> AnchorEstimate:
-        """Return the branches of at least the probability LIKELY_BRANCH, whatever the `candidates` were."""
-        del candidates
+    def anchor(self, knowledge: Knowledge, allowed: tuple[Branch, ...]) -> AnchorEstimate:
+        """Return the branches of at least the probability LIKELY_BRANCH, whatever was `allowed` before."""
+        del allowed
         known = followed(knowledge)
         if known is None:
             return AnchorEstimate(knowledge.own_anchor, (), RANGE_MARGIN)

@@ -61,15 +61,15 @@ WIDE = 0.25
 Gauss-Newton bridges smaller ones."""
 
 RIDGE_BETWEEN = 2.0
-"""The log-likelihood by which two candidates must exceed that between them to be two, however near they are.
+"""The log-likelihood by which two guesses must exceed that between them to be two, however near they are.
 
-Without it, two exact placements 0.01 rad apart are one; with much less, rounding makes one candidate two."""
+Without it, two exact placements 0.01 rad apart are one; with much less, rounding makes one guess two."""
 
 HEADING_DAMPING = 1e-3
 """The damping of headings in the first refinement, as a fraction of their information."""
 
 CROWD = 60
-"""The number of candidates that are kept between refinements."""
+"""The number of guesses that are kept between refinements."""
 
 STARTS = 12
 """The number of placements from which fits begin."""
@@ -126,7 +126,7 @@ class Encounter(NamedTuple):
 
 
 class Placed(NamedTuple):
-    """A candidate for the placement of both robots in <W>, by the mutual ranges."""
+    """A guess for the placement of both robots in <W>, by the mutual ranges."""
 
     log_likelihood: float
     """The log-likelihood of the mutual ranges used, and of the offsets, up to a constant."""
@@ -191,7 +191,7 @@ def placements(own: tuple[Fit, Fit], pair: JointMeasurements) -> list[Placed]:
     The robot nearer to its anchor is rotated through all headings. One mutual range then leaves two headings
     of the other robot, at the intersections of the circles about its anchor and about the first robot
     (Section III.C with one circle rotated). The circle about its anchor is also tried with other radii,
-    within its uncertainty. The other mutual ranges determine which candidates are likely.
+    within its uncertainty. The other mutual ranges determine which guesses are likely.
     """
     mutual = np.flatnonzero(pair.ranges.mutual)
     places = pair.mutual_places if len(pair.mutual_places) >= SEED_RANGES else np.arange(len(mutual))
@@ -243,9 +243,9 @@ def _turned(
 ) -> Array:
     """Return the likeliest rotations and offsets, with their log-likelihoods as a last column; shape (n, 9).
 
-    The candidates of the scan are refined by Gauss-Newton. The noise of the search decreases from the
-    resolution of the scan to that of the ranges, because candidates between which the ranges distinguish
-    would otherwise be merged. At last, two candidates are merged if the robots' positions differ by less than
+    The guesses of the scan are refined by Gauss-Newton. The noise of the search decreases from the
+    resolution of the scan to that of the ranges, because guesses between which the ranges distinguish
+    would otherwise be merged. At last, two guesses are merged if the robots' positions differ by less than
     MERGED_WITHIN R, unless the likelihood falls between them. See `hypotheses.c`. Raises Singular.
     """
     ends = sorted({0, len(rho) - 1})

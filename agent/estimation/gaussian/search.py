@@ -80,7 +80,7 @@ WARM_DECREASE = 0.1
 """The expected decrease of the first step of a fit that begins at the last one, which has one range less."""
 
 
-class Candidate(NamedTuple):
+class Locatable(NamedTuple):
     """Robots that may be located next."""
 
     decisive: int
@@ -114,7 +114,7 @@ def from_nothing(measured: JointMeasurements, fewest: int) -> Posterior:
 def extended(
     known: Posterior,
     measured: JointMeasurements,
-    failed: Sequence[Candidate] = (),
+    failed: Sequence[Locatable] = (),
     fewest: int = FEWEST_DECISIVE,
 ) -> Posterior:
     """Return the hypotheses `known` with all further robots that their ranges locate.
@@ -122,9 +122,9 @@ def extended(
     Those in `failed` are not tried. If none are known, those of robots with a prior come first.
     """
     tried, known = set(failed), known if known.hypotheses else begun(measured)
-    while left := [one for one in candidates(known.located, measured, fewest) if one not in tried]:
+    while left := [one for one in locatable(known.located, measured, fewest) if one not in tried]:
         tried.add(left[0])
-        more = _with(known, left[0], measured, fewest)
+        more = _with(known, left[0].robots, measured, fewest)
         known = more if more.hypotheses else known
     return known
 
@@ -139,16 +139,16 @@ def begun(measured: JointMeasurements) -> Posterior:
     return Posterior(measured.started, found) if found else NO_HYPOTHESES
 
 
-def candidates(
+def locatable(
     located: Sequence[int], measured: JointMeasurements, fewest: int = FEWEST_DECISIVE
-) -> list[Candidate]:
+) -> list[Locatable]:
     """Return which robots may be located next, those with the most decisive ranges first."""
     measured = measured.as_surveyed
     found = [*_single(located, measured), *_paired(located, measured, fewest)]
     return sorted(found, key=lambda one: (-one.decisive, -len(one.robots), one.robots))
 
 
-def _single(located: Sequence[int], measured: JointMeasurements) -> Iterator[Candidate]:
+def _single(located: Sequence[int], measured: JointMeasurements) -> Iterator[Locatable]:
     ranges = measured.ranges
     for robot in range(len(measured.robots)):
         if robot in located or robot in measured.placed:
@@ -158,7 +158,7 @@ def _single(located: Sequence[int], measured: JointMeasurements) -> Iterator[Can
         places = [tuple(one) for one in ranges.place[fixed].tolist()]
         decisive = len(rows) - max([places.count(one) for one in set(places)], default=0)
         if decisive >= (FEWEST_TO_LOCATE_ANCHOR if measured.is_anchor(robot) else FEWEST_DECISIVE):
-            yield Candidate(decisive, (robot,))
+            yield Locatable(decisive, (robot,))
 
 
 def beacons(robot: int, located: Sequence[int], measured: JointMeasurements) -> Places:
@@ -168,12 +168,12 @@ def beacons(robot: int, located: Sequence[int], measured: JointMeasurements) -> 
     return np.flatnonzero(ranges.of(robot) & ((other < 0) | np.isin(other, np.array(located, np.intp))))
 
 
-def _paired(located: Sequence[int], measured: JointMeasurements, fewest: int) -> Iterator[Candidate]:
+def _paired(located: Sequence[int], measured: JointMeasurements, fewest: int) -> Iterator[Locatable]:
     for (a, b), rows in measured.ranges.pairs:
         if b < 0 or a in located or b in located or len(rows) < fewest:
             continue
         if _anchors_of_pair(a, b, measured, fewest) is not None:
-            yield Candidate(len(rows), (a, b))
+            yield Locatable(len(rows), (a, b))
 
 
 def _anchors_of_pair(
@@ -197,17 +197,17 @@ def _anchors_of_pair(
 # --- locating ---------------------------------------------------------------------------------------------
 
 
-def _with(known: Posterior, candidate: Candidate, measured: JointMeasurements, fewest: int) -> Posterior:
-    """Return the hypotheses with the robots of `candidate`; none if their ranges do not locate them."""
-    located = tuple(sorted((*known.located, *candidate.robots)))
+def _with(known: Posterior, robots: tuple[int, ...], measured: JointMeasurements, fewest: int) -> Posterior:
+    """Return the hypotheses with `robots`; none if their ranges do not locate them."""
+    located = tuple(sorted((*known.located, *robots)))
     part, before = measured.some(located), known.hypotheses or (None,)
     found = []
     for i, one in enumerate(before):
-        alone = _alone(candidate, one, known.located, measured, fewest)
+        alone = _alone(robots, one, known.located, measured, fewest)
         if whole := alone == part:
             alone = part  # which has its problem
-        new = _of_pair(alone) if len(candidate.robots) == 2 else _of_robot(alone)
-        if part.started and len(candidate.robots) == 1:
+        new = _of_pair(alone) if len(robots) == 2 else _of_robot(alone)
+        if part.started and len(robots) == 1:
             new = _determined(new, alone)
         if whole:
             return Posterior(located, new)
@@ -219,7 +219,7 @@ def _with(known: Posterior, candidate: Candidate, measured: JointMeasurements, f
     least = max([weight for _, weight, _, _ in found], default=0.0) + math.log(NEGLIGIBLE_PROBABILITY)
     # all poses of the new robots under the first hypothesis, and the first pose under all others
     found.sort(key=lambda each: (each[0] > 0, -each[1]))
-    order = np.argsort([*known.located, *candidate.robots])
+    order = np.argsort([*known.located, *robots])
     count = len(known.located)
     anchors = np.zeros((0, 3)) if part.prior is None else part.prior.mean[len(located) :]
     starts = []
@@ -266,17 +266,17 @@ def _with_more(
 
 
 def _alone(
-    candidate: Candidate,
+    robots: tuple[int, ...],
     one: Hypothesis | None,
     located: tuple[int, ...],
     measured: JointMeasurements,
     fewest: int,
 ) -> JointMeasurements:
-    """Return the measurements by which the robots of `candidate` are located under the hypothesis `one`."""
+    """Return the measurements by which `robots` are located under the hypothesis `one`."""
     measured = measured.as_surveyed
-    if len(candidate.robots) == 1:
-        return among_beacons(candidate.robots[0], one, located, measured)
-    (a, b), ranges = candidate.robots, measured.ranges
+    if len(robots) == 1:
+        return among_beacons(robots[0], one, located, measured)
+    (a, b), ranges = robots, measured.ranges
     own = _anchors_of_pair(a, b, measured, fewest)
     assert own is not None
     mutual = np.flatnonzero((ranges.first == a) & (ranges.second == b))
