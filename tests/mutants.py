@@ -122,11 +122,11 @@ def lost() -> None:
     edited(
         exact_estimator,
         "_with_placements",
-        "    return replace(belief, placements=remaining",
+        "    return replace(posterior, placements=remaining",
         "    gone = [one.range is None for one in observations]\n"
         "    if len(remaining) > 1 and (True, False) in zip(gone, gone[1:]):\n"
         "        remaining = remaining[1:]\n"
-        "    return replace(belief, placements=remaining",
+        "    return replace(posterior, placements=remaining",
     )
 
 

@@ -105,7 +105,7 @@ class Wrapping(Planner[RobotState, Parcel]):
         return self.inner.malformed(body.log)
 
     def summary(self, state: RobotState) -> Summary:
-        return Summary(hypotheses=len(state.belief.placements), blocking_reason=self.note or None)
+        return Summary(hypotheses=len(state.posterior.placements), blocking_reason=self.note or None)
 
 
 class Idle(Planner[int, None]):

@@ -376,7 +376,7 @@ def test_the_last_manoeuvre_leaves_no_more_placements_out_of_range_than_it_must(
             if isinstance(state.task, LastManoeuvre) and not isinstance(
                 moment.before["b"].task, LastManoeuvre
             ):
-                placements = state.belief.placements
+                placements = state.posterior.placements
                 command = moment.commands["b"]
                 out = len(left_out(state, command.v, command.omega, placements))
                 assert out <= min(len(left_out(state, *one, placements)) for one in grid(SLOW.mission)), seed
@@ -401,8 +401,8 @@ def test_no_detection_selects_the_placement_out_of_range_and_b_drives_back_to_re
     assert back.heard["b"]
     state = Assured().decide(setting_out.observed["b"], setting_out.heard["b"])
     for robot in "ab":
-        named = Assured().decide(back.observed[robot], back.heard[robot]).belief.placements
-        (only,) = left_out(state, command.v, command.omega, state.belief.placements)
+        named = Assured().decide(back.observed[robot], back.heard[robot]).posterior.placements
+        (only,) = left_out(state, command.v, command.omega, state.posterior.placements)
         assert len(named) == 1
         assert same_placement(named[0], only, 1e-6)
 

@@ -201,7 +201,7 @@ def test_the_pose_after_a_long_way_does_not_depend_on_the_hypotheses_of_its_meet
         state = states(run, robot)[-1]
         for met in state.agenda.confirming.meetings:
             expected = later_pose(met, state)
-            again = later_pose(replace(met, belief=replace(met.belief, pair=())), state)
+            again = later_pose(replace(met, posterior=replace(met.posterior, pair=())), state)
             if expected is None:
                 continue
             found += 1

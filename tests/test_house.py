@@ -281,7 +281,7 @@ def test_robot_states_and_worlds_are_immutable() -> None:
         state,
         state.log,
         state.peer_state,
-        state.belief,
+        state.posterior,
         state.config,
         world,
         world.truth,

@@ -17,7 +17,7 @@ from msgspec.structs import replace
 
 from agent.estimation.gaussian.mission_measurements import beginning, path_of
 from agent.estimation.gaussian.odometry_noise import variances
-from agent.estimation.knowledge import Belief, Knowledge
+from agent.estimation.knowledge import Knowledge, MeetingPosterior
 from agent.peer.motion_log import MotionLog
 from agent.peer.peer_state import PeerState
 from agent.planning.assured import Assured
@@ -113,18 +113,18 @@ def test_a_recording_in_which_a_left_b_is_audited_replayed_and_told(tmp_path: Pa
 
 @pytest.mark.long
 def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:
-    known: dict[str, list[Belief]] = {"a": [], "b": []}
+    known: dict[str, list[MeetingPosterior]] = {"a": [], "b": []}
 
     class Watched(Assured):
         def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
             decided = super().decide(state, reports)
-            known[state.config.robot].append(decided.belief)
+            known[state.config.robot].append(decided.posterior)
             return decided
 
     played(unsettled(UNSETTLED[0]), {}, planner_of=lambda _: Watched())
-    for beliefs in known.values():
+    for posteriors in known.values():
         again = [
-            now for before, now in pairwise(beliefs) if now.attempt.beginning != before.attempt.beginning
+            now for before, now in pairwise(posteriors) if now.attempt.beginning != before.attempt.beginning
         ]
         assert len(again) == 1
         assert (again[0].pair, again[0].attempt.ranges_at_last_search, again[0].attempt.p_value) == (
@@ -132,7 +132,7 @@ def test_neither_robot_keeps_hypotheses_of_the_meeting_that_a_left() -> None:
             0,
             None,
         )
-        assert beliefs[-1].pair, "the second meeting gives new ones"
+        assert posteriors[-1].pair, "the second meeting gives new ones"
     assert known["a"][-1].attempt.beginning == known["b"][-1].attempt.beginning > 60
 
 

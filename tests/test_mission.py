@@ -209,11 +209,11 @@ def test_a_single_hypothesis_is_checked_before_it_is_claimed() -> None:
     """Two mutual ranges and D have no redundancy, so b makes a manoeuvre even with one placement left."""
     second = next(step for step in steps("paper-1") if step.commands["b"].task == "last-manoeuvre")
     state, heard = second.observed["b"], second.heard["b"]
-    possible = planner_of(state).decide(state, heard).belief.placements
+    possible = planner_of(state).decide(state, heard).posterior.placements
     assert len(possible) == 4
     for placement in possible:
-        posterior = replace(state.belief, placements=(placement,), hypothesis_counts=(4, 1))
-        decided = planner_of(state).decide(replace(state, belief=posterior), heard)
+        posterior = replace(state.posterior, placements=(placement,), hypothesis_counts=(4, 1))
+        decided = planner_of(state).decide(replace(state, posterior=posterior), heard)
         assert decided.verdict is None
         assert planner_of(decided).command(decided).v == 1.0
 

@@ -14,7 +14,7 @@ import tandem
 from agent.estimation.gaussian import followed_pair
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
-from agent.estimation.knowledge import Belief
+from agent.estimation.knowledge import MeetingPosterior
 from agent.estimation.posterior import Posterior
 from agent.planning.assured import Assured
 from agent.planning.phase2_orbit import OFF_RADIUS, orientation
@@ -269,9 +269,9 @@ def test_both_robots_have_the_same_hypotheses_while_reports_arrive() -> None:
     held = 0
     for step in steps(scenario_of(SIGMA, 4)):
         a, b = step.before["a"], step.before["b"]
-        if a.belief.pair and b.belief.pair:
-            assert a.belief.pair == b.belief.pair
-            assert a.belief.blocking_reason == b.belief.blocking_reason
+        if a.posterior.pair and b.posterior.pair:
+            assert a.posterior.pair == b.posterior.pair
+            assert a.posterior.blocking_reason == b.posterior.blocking_reason
             held += 1
     assert held > 3
 
@@ -368,7 +368,7 @@ def test_between_two_estimates_the_poses_of_a_robot_move_with_its_odometry() -> 
     config = scenario_of(SIGMA, 0).config("a", None)
     then, now = Pose(1.0, 2.0, 0.5), Pose(1.6, 2.2, 0.9)
     possible = (Pose(4.0, -1.0, 2.0), Pose(0.0, 0.0, -1.0))
-    state = RobotState(config, odometry=now, belief=Belief(poses=possible, odometry=then))
+    state = RobotState(config, odometry=now, posterior=MeetingPosterior(poses=possible, odometry=then))
     moved = compose(inverse(then), now)
     for before, after in zip(possible, PLANNER.estimate(state).world, strict=True):
         way = compose(inverse(before), after)

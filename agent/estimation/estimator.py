@@ -11,7 +11,7 @@ from typing import NamedTuple, Protocol
 
 from agent.estimation.closed_forms import Placement
 from agent.estimation.exact import Branch, PairObservation
-from agent.estimation.knowledge import Belief, Knowledge, OwnAnchor
+from agent.estimation.knowledge import Knowledge, MeetingPosterior, OwnAnchor
 from protocol.messages import Observation, Verdict
 from protocol.motion import ORIGIN, Pose
 
@@ -35,7 +35,7 @@ class AnchorEstimate(NamedTuple):
 class PairEstimate(NamedTuple):
     """The result of the logs and the mutual ranges of both robots."""
 
-    belief: Belief
+    posterior: MeetingPosterior
     verdict: Verdict | None
     """The verdict that follows from the estimate; None if it depends on further ranges."""
     placements: tuple[Placement, ...]
@@ -49,7 +49,7 @@ class PairEstimate(NamedTuple):
     checked: bool = False
     """True if a redundant mutual range has confirmed the placements."""
     observations: tuple[PairObservation, ...] = ()
-    """The ticks from which the placements follow; empty if the belief has their covariance instead."""
+    """The ticks from which the placements follow; empty if the posterior has their covariance instead."""
 
 
 class Estimator(Protocol):

@@ -14,7 +14,7 @@ from agent.estimation import precision
 from agent.estimation.closed_forms import placements
 from agent.estimation.estimator import AnchorEstimate, Estimator, PairEstimate
 from agent.estimation.exact import Branch, PairObservation, branches, weigh_branches, weigh_placements
-from agent.estimation.knowledge import Belief, Knowledge, off_anchor
+from agent.estimation.knowledge import Knowledge, MeetingPosterior, off_anchor
 from protocol.messages import Inconsistent, Localised, Observation, Verdict
 from protocol.motion import ORIGIN, REST, travelled
 from protocol.rounding import SAME_ANCHORS
@@ -91,14 +91,14 @@ class ExactEstimator(msgspec.Struct, frozen=True):
         pair_base = base(away_from_m2, odometry_rounding)
         if pair_base is None:
             return None
-        belief, peers = knowledge.belief, knowledge.belief.peer_anchor
+        posterior, peers = knowledge.posterior, knowledge.posterior.peer_anchor
         if peers is None:
             peers = precision.peer_anchor(knowledge)
-            belief = replace(belief, peer_anchor=peers)
+            posterior = replace(posterior, peer_anchor=peers)
         anchor_errors = knowledge.own_anchor.error + peers
         error_bound = anchor_errors + odometry_rounding
-        belief = _with_placements(knowledge, belief, observations, pair_base, error_bound)
-        remaining = belief.placements
+        posterior = _with_placements(knowledge, posterior, observations, pair_base, error_bound)
+        remaining = posterior.placements
         checked = redundant(ranged, pair_base)
         verdict: Verdict | None = None
         if not remaining:
@@ -111,23 +111,23 @@ class ExactEstimator(msgspec.Struct, frozen=True):
             verdict = Localised(knowledge.world_pose(remaining[0]))
         failure = "does not select a placement" if checked else "could not be measured: b left a's range"
         latest, failure = observations[-1], f"the third mutual range {failure}"
-        return PairEstimate(belief, verdict, remaining, failure, latest.a, latest.b, checked, observations)
+        return PairEstimate(posterior, verdict, remaining, failure, latest.a, latest.b, checked, observations)
 
 
 def _with_placements(
     knowledge: Knowledge,
-    belief: Belief,
+    posterior: MeetingPosterior,
     observations: Sequence[PairObservation],
     pair_base: tuple[PairObservation, PairObservation],
     floor: float,
-) -> Belief:
-    """Return `belief` with the solutions of eq. (7) that agree with every tick in `observations`.
+) -> MeetingPosterior:
+    """Return `posterior` with the solutions of eq. (7) that agree with every tick in `observations`.
 
     A tick without a mutual range rules out the placements that predict both robots in range. `floor` is the
     bound in m on the error of a predicted range.
     """
-    reach, solutions = knowledge.config.mission.sensing_range, belief.placements
-    counts = belief.hypothesis_counts
+    reach, solutions = knowledge.config.mission.sensing_range, posterior.placements
+    counts = posterior.hypothesis_counts
     if counts is None:
         (first, second), distance = pair_base, knowledge.config.anchor_distance
         assert first.range is not None
@@ -137,7 +137,8 @@ def _with_placements(
         possible = weigh_placements(solutions, undetected, reach, floor)
         counts = (len(solutions), len(possible))
     remaining = weigh_placements(solutions, observations, reach, floor)
-    return replace(belief, placements=remaining, hypothesis_counts=counts, observations=tuple(observations))
+    seen = tuple(observations)
+    return replace(posterior, placements=remaining, hypothesis_counts=counts, observations=seen)
 
 
 def base(

@@ -41,10 +41,10 @@ class OwnAnchor(msgspec.Struct, frozen=True):
 
 
 class Attempt(msgspec.Struct, frozen=True):
-    """The searches and the returns of a robot with noisy sensors since a last began again in a meeting."""
+    """The searches and the returns of a robot with noisy sensors in a meeting since `beginning`."""
 
     beginning: int = 0
-    """The tick from which on the measurements of a count in `Belief.pair` (see `beginning`)."""
+    """The first tick whose measurements of a count: that in which a has last begun phase 1 again, or 0."""
     ranges_at_last_search: int = 0
     """The number of mutual ranges at the latest search of the whole plane for hypotheses."""
     p_value: float | None = None
@@ -57,8 +57,8 @@ class Attempt(msgspec.Struct, frozen=True):
     """The number of times that the robot drove back to its anchor."""
 
 
-class Belief(msgspec.Struct, frozen=True):
-    """The results of phase 3, in one meeting: hypotheses, counts and the reasons for and against a claim.
+class MeetingPosterior(msgspec.Struct, frozen=True):
+    """The posterior of phase 3 in one meeting: hypotheses, their counts, and what prevents a claim.
 
     Fields marked "exact sensors" or "noisy sensors" are set only in that case.
     """
@@ -94,7 +94,7 @@ class Belief(msgspec.Struct, frozen=True):
 
 
 class Knowledge(msgspec.Struct, frozen=True):
-    """The measurements and the reports that a robot has, and its beliefs. An `Estimator` works on it."""
+    """The measurements and the reports that a robot has, and what follows from them for an `Estimator`."""
 
     config: RobotConfig
     tick: int = -1
@@ -104,7 +104,7 @@ class Knowledge(msgspec.Struct, frozen=True):
     ranges: Mapping[str, tuple[Ranged, ...]] = {}
     """The ranges to each other robot."""
     own_anchor: OwnAnchor = OwnAnchor()
-    belief: Belief = Belief()
+    posterior: MeetingPosterior = MeetingPosterior()
     peer_state: PeerState = PeerState()
     solver: Solver | None = None
     """Noisy sensors: the solver that the planner has chosen; None for the smoother."""
@@ -141,11 +141,11 @@ class Knowledge(msgspec.Struct, frozen=True):
 
     @property
     def poses(self) -> tuple[Pose, ...]:
-        """Return `belief.poses`, moved by the odometry since the latest estimate."""
-        if self.belief.odometry == self.odometry:
-            return self.belief.poses
-        moved = compose(inverse(self.belief.odometry), self.odometry)
-        return tuple([compose(pose, moved) for pose in self.belief.poses])
+        """Return `posterior.poses`, moved by the odometry since the latest estimate."""
+        if self.posterior.odometry == self.odometry:
+            return self.posterior.poses
+        moved = compose(inverse(self.posterior.odometry), self.odometry)
+        return tuple([compose(pose, moved) for pose in self.posterior.poses])
 
     @property
     def known_through(self) -> int:
@@ -165,12 +165,12 @@ class Knowledge(msgspec.Struct, frozen=True):
     def pair_observations(self, first: int) -> tuple[PairObservation, ...]:
         """Return both poses and the mutual range of each tick from `first` on that both logs cover.
 
-        Those in `belief.observations` are not computed again: logs are only extended.
+        Those in `posterior.observations` are not computed again: logs are only extended.
         """
         last = min(self.tick, self.peer_state.peer.through)
         if self.peer_state.start is None or last < first:
             return ()
-        observations = self.belief.observations
+        observations = self.posterior.observations
         if observations and observations[0].tick != first:
             observations = ()
         a_known, b_known = [at.a for at in observations], [at.b for at in observations]

@@ -6,7 +6,7 @@ import math
 
 from msgspec.structs import replace
 
-from agent.estimation.knowledge import Belief
+from agent.estimation.knowledge import MeetingPosterior
 from agent.peer.peer_state import PeerState
 from agent.planning import phase2_orbit, searching, visit
 from agent.planning.state import RobotState
@@ -164,7 +164,7 @@ def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | N
         state,
         config=state.config.in_meeting(peer, role, orbits),
         in_contact=bool(mutual) and mutual[-1].tick == state.tick,
-        belief=Belief(earlier_ranges=len(mutual)),
+        posterior=MeetingPosterior(earlier_ranges=len(mutual)),
         peer_state=PeerState(),
         task=Asleep(),
         plan=None,

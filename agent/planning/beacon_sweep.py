@@ -98,13 +98,13 @@ def begun(state: RobotState, part: int) -> RobotState:
     assert fix is not None
     known = fix.known
     # after a visit in vain, or one that contradicts what this robot knows
-    if not state.belief.pair or config.peer != known.config.peer:
+    if not state.posterior.pair or config.peer != known.config.peer:
         state = replace(
             state,
             config=known.config,
             ranges={**state.ranges, known.config.peer: known.mutual},
             own_anchor=known.own_anchor,
-            belief=known.belief,
+            posterior=known.posterior,
             peer_state=known.peer_state,
         )
     due = replace(state.agenda.own_pose, estimated_tick=None, reference=None)
@@ -210,7 +210,7 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
 def beacon_place(state: RobotState) -> Place:
     """Return the most probable position of the beacon in <W>, in m; its anchor if there is no hypothesis."""
     measured = _measured(state)
-    found = follow(Posterior(PAIR, state.belief.pair), measured).hypotheses
+    found = follow(Posterior(PAIR, state.posterior.pair), measured).hypotheses
     if not found:
         return state.config.peer_anchor.x, state.config.peer_anchor.y
     x, y, _ = found[0].fit.poses[1 if state.config.role == "a" else 0].tolist()
@@ -237,7 +237,7 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
         task = Sweeping(transformed(turn, task.places))
     elif isinstance(task, Looping):
         task = replace(task, then=transformed(turn, task.then))
-    belief = replace(state.belief, pair=tuple(scored))
+    posterior = replace(state.posterior, pair=tuple(scored))
     ranges = len(state.log.ranges) + len(state.mutual)
     was_lost = before.sigma > LOST_SIGMA * state.config.mission.sensing_range
     own_pose = replace(
@@ -247,7 +247,7 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
         sigma=now.covariance.position_sigma,
         ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
     )
-    return replace(framed, belief=belief, task=task).with_agenda(own_pose=own_pose)
+    return replace(framed, posterior=posterior, task=task).with_agenda(own_pose=own_pose)
 
 
 def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:

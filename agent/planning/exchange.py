@@ -74,7 +74,7 @@ def _reported_log(state: RobotState) -> MotionLog:
     attack = state.config.attack
     if attack is None:
         return state.log
-    ends = state.own_anchor.done_tick, state.belief.encounter_tick
+    ends = state.own_anchor.done_tick, state.posterior.encounter_tick
     return false_reports.falsified_log(state.log, attack, *ends, state.config.mission.period)
 
 
@@ -250,26 +250,26 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def estimate(self, state: RobotState) -> Estimate:
         """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
-        own, belief, verdict = state.own_anchor, state.belief, state.verdict
+        own, posterior, verdict = state.own_anchor, state.posterior, state.verdict
         branches_left = own.branches
         if not branches_left and own.branch is not None:
             branches_left = (own.branch,)
         elif not branches_left and isinstance(state.task, tasks.ThirdPoint):
             branches_left = state.task.branches
-        if belief.poses:
+        if posterior.poses:
             world: tuple[Pose, ...] = state.poses
         elif isinstance(verdict, Localised):
             world = (verdict.pose,)
         else:
-            world = tuple([state.world_pose(placement) for placement in belief.placements])
+            world = tuple([state.world_pose(placement) for placement in posterior.placements])
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
             local=tuple(phase1_anchor.local(branches_left, state.odometry)),
             world=world,
             localised=isinstance(verdict, Localised),
-            probabilities=tuple([one.probability for one in belief.pair or own.hypotheses]),
-            covariance=belief.covariance,
+            probabilities=tuple([one.probability for one in posterior.pair or own.hypotheses]),
+            covariance=posterior.covariance,
         )
 
     def last_manoeuvre(self, question: Question, mission: Mission) -> Plan | None:
@@ -306,20 +306,22 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def summary(self, state: RobotState) -> Summary:
         """Return the numbers of ranges and hypotheses, and the last manoeuvre."""
-        own, belief, plan = state.own_anchor, state.belief, state.plan
+        own, posterior, plan = state.own_anchor, state.posterior, state.plan
         return Summary(
             anchor_ranges=len(state.log.ranges),
             branch=own.kind,
             alpha=own.branch.alpha if own.branch is not None else None,
-            candidates=belief.hypothesis_counts,
+            candidates=posterior.hypothesis_counts,
             last_turn_rate=plan.command.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,
             hypotheses=(
-                len(belief.pair or belief.placements) if belief.hypothesis_counts is not None else None
+                len(posterior.pair or posterior.placements)
+                if posterior.hypothesis_counts is not None
+                else None
             ),
-            probability=belief.pair[0].probability if belief.pair else None,
-            blocking_reason=belief.blocking_reason,
-            p_value=belief.attempt.p_value,
+            probability=posterior.pair[0].probability if posterior.pair else None,
+            blocking_reason=posterior.blocking_reason,
+            p_value=posterior.attempt.p_value,
         )
 
     def misreport(self, body: Report, observations: Sequence[Observation]) -> str | None:

@@ -38,15 +38,15 @@ def begun(state: RobotState) -> RobotState:
 
     With a safety distance, a begins only when it knows that b stands far enough away.
     """
-    belief = replace(state.belief, encounter_tick=state.tick)
+    posterior = replace(state.posterior, encounter_tick=state.tick)
     if state.config.role == "b":
-        return replace(state, task=tasks.Standing(), belief=belief)
+        return replace(state, task=tasks.Standing(), posterior=posterior)
     # In contact without a range (a drop-out), the peer is only known to be within R.
     rho = state.mutual[-1].range if state.mutual else state.config.mission.sensing_range
     if state.config.mission.safety_distance and not _may_drive_straight(state):
         return state
     straight = tasks.Straight("peer", state.odometry, rho)
-    return replace(state, task=straight, belief=belief)
+    return replace(state, task=straight, posterior=posterior)
 
 
 def _may_drive_straight(state: RobotState) -> bool:
@@ -84,14 +84,14 @@ def with_new_ticks(state: RobotState) -> RobotState | None:
 def pair_estimate(
     state: RobotState, first_tick: int, *, second_range: bool
 ) -> tuple[RobotState, PairEstimate | None]:
-    """Return `state` with the belief and the verdict of the estimate of both poses, and the estimate.
+    """Return `state` with the posterior and the verdict of the estimate of both poses, and the estimate.
 
     The arguments are those of `Estimator.pair`. The estimate is None if the measurements do not suffice yet.
     """
     estimate = state.estimator.pair(state, first_tick, second_range=second_range)
     if estimate is None:
         return state, None
-    state = replace(state, belief=estimate.belief)
+    state = replace(state, posterior=estimate.posterior)
     return state if estimate.verdict is None else state.ended(estimate.verdict), estimate
 
 
@@ -120,7 +120,7 @@ def as_published(state: RobotState, planned: PlannedLast) -> RobotState:
     evaluated = with_new_ticks(state)
     if evaluated is None:
         return state
-    first_tick, moved = state.belief.encounter_tick, state.plan is not None
+    first_tick, moved = state.posterior.encounter_tick, state.plan is not None
     assert first_tick is not None
     a_waits = not isinstance(state.task, tasks.Standing) or state.peer_state.state == tasks.Waiting.name
     second = a_waits or moved
@@ -213,10 +213,10 @@ def surveyed(state: RobotState, planned: JointManoeuvres) -> RobotState:
         return state
     if state.known_through < state.log.moved(state.config.mission.noise.standstill_bound):
         return state.doing(tasks.Listening())
-    if state.belief.encounter_tick is None:
-        state = replace(state, belief=replace(state.belief, encounter_tick=state.tick))
-    measured, belief, hypotheses, verdict = followed(state)
-    state = replace(state, belief=belief)
+    if state.posterior.encounter_tick is None:
+        state = replace(state, posterior=replace(state.posterior, encounter_tick=state.tick))
+    measured, posterior, hypotheses, verdict = followed(state)
+    state = replace(state, posterior=posterior)
     if verdict is not None:
         return state.ended(verdict)
     if state.config.role == "a" and _measures_in_vain(state, measured):
@@ -235,8 +235,8 @@ def surveyed(state: RobotState, planned: JointManoeuvres) -> RobotState:
 
 def _measures_in_vain(state: RobotState, pair: JointMeasurements) -> bool:
     """Return whether this meeting has so many ranges that more will hardly settle the poses."""
-    many = MANY_MUTUAL_RANGES * (1 + state.belief.attempt.returns)
-    return len(pair.mutual_places) >= many and len(state.mutual) - state.belief.earlier_ranges >= many
+    many = MANY_MUTUAL_RANGES * (1 + state.posterior.attempt.returns)
+    return len(pair.mutual_places) >= many and len(state.mutual) - state.posterior.earlier_ranges >= many
 
 
 def _drive_without_hypotheses(state: RobotState) -> RobotState:
@@ -253,12 +253,12 @@ def _leave(state: RobotState) -> RobotState:
 
     A robot a without a range to its anchor meanwhile begins again, as after a missed encounter.
     """
-    config, belief = state.config, state.belief
+    config, posterior = state.config, state.posterior
     if not (config.begins_again and has_failed(state, state.log.ranges[-1].tick, state.tick + 1)):
         return range_seeking.turned_back(state)
     start = state.start
-    if belief.pair:
-        here = belief.poses[0]
+    if posterior.pair:
+        here = posterior.poses[0]
         local = Pose(here.x - config.anchor.x, here.y - config.anchor.y, here.heading)
         start = compose(local, inverse(state.odometry))
     return range_seeking.begun_again(state, start)

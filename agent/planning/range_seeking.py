@@ -87,9 +87,9 @@ def turned_back(state: RobotState) -> RobotState:
     last_range_tick = state.log.ranges[-1].tick
     place = state.log.pose(ORIGIN, last_range_tick, state.config.mission.period)
     own_anchor = replace(state.own_anchor, hypotheses=())
-    attempt = replace(state.belief.attempt, returns=state.belief.attempt.returns + 1)
-    belief = replace(state.belief, encounter_tick=None, pair=(), attempt=attempt)
-    return replace(state, task=Homing((place.x, place.y)), own_anchor=own_anchor, belief=belief)
+    attempt = replace(state.posterior.attempt, returns=state.posterior.attempt.returns + 1)
+    posterior = replace(state.posterior, encounter_tick=None, pair=(), attempt=attempt)
+    return replace(state, task=Homing((place.x, place.y)), own_anchor=own_anchor, posterior=posterior)
 
 
 def begun_again(state: RobotState, start: Pose) -> RobotState:

@@ -133,7 +133,7 @@ def decisions(pair: PairRecord) -> dict[int, Decision]:
     for role in ROLES:
         before: object = ()
         for state in pair.states(role):
-            hypotheses = state.belief.pair
+            hypotheses = state.posterior.pair
             surveys = isinstance(state.task, Surveying) and state.phase == 3
             if hypotheses and hypotheses is not before and (surveys or state.verdict is not None):
                 found.setdefault(state.tick, {})[role] = state
@@ -177,7 +177,7 @@ def draw_decisions(pair: PairRecord, medium: Medium = SCREEN) -> Figure | Absent
 
 def _decided(tick: int, made: Decision, number: int) -> str:
     state = next(iter(made.values()))
-    count, probability = len(state.belief.pair), state.belief.pair[0].probability
+    count, probability = len(state.posterior.pair), state.posterior.pair[0].probability
     hypotheses = f"{count} hypotheses" if count > 1 else "1 hypothesis"
     claim = ", claim" if any(state.verdict is not None for state in made.values()) else ""
     first = f"{hypotheses}, first {math.floor(1e4 * probability) / 100:g} %{claim}"
@@ -188,16 +188,16 @@ def _seen(pair: PairRecord, tick: int, made: Decision) -> list[Pose]:
     """Return the poses that the window contains: true ones, probable ones, and ends of manoeuvres."""
     poses = list(_places(pair, tick).values())
     for state in made.values():
-        held = zip(state.belief.poses, state.belief.pair, strict=True)
+        held = zip(state.posterior.poses, state.posterior.pair, strict=True)
         poses += [pose for pose, one in held if one.probability >= SHOWN_PROBABILITY] + _ends(state, pair)
     return poses
 
 
 def _decision(axes: Axes, pair: PairRecord, tick: int, made: Decision) -> None:
     """Draw the hypotheses, the larger the more probable, joined if both robots have the same ones."""
-    held = [[one.fit.poses.tolist() for one in state.belief.pair] for state in made.values()]
+    held = [[one.fit.poses.tolist() for one in state.posterior.pair] for state in made.values()]
     if len(held) == 2 and held[0] == held[1]:
-        for two in zip(*[state.belief.poses for state in made.values()], strict=True):
+        for two in zip(*[state.posterior.poses for state in made.values()], strict=True):
             trace(axes, two, "-", lw=0.7, color=PALER, zorder=3)
     for role, state in made.items():
         colour = COLOURS[role]
@@ -209,7 +209,7 @@ def _decision(axes: Axes, pair: PairRecord, tick: int, made: Decision) -> None:
                         gid=f"sigma-{tick}-{role}",
                     )
                 )  # fmt: skip
-        for i, (pose, one) in enumerate(zip(state.belief.poses, state.belief.pair, strict=True)):
+        for i, (pose, one) in enumerate(zip(state.posterior.poses, state.posterior.pair, strict=True)):
             trace(
                 axes, [pose], ROLE_MARKERS[role]["marker"], ms=2.5 + 4.5 * math.sqrt(one.probability),
                 mfc="white" if i else colour, mec=colour, mew=0.9, zorder=4 if i else 5,
@@ -230,9 +230,9 @@ def _places(pair: PairRecord, tick: int) -> dict[Role, Pose]:
 
 def _ends(state: RobotState, pair: PairRecord) -> list[Pose]:
     """Return poses along the chosen manoeuvre from the most probable pose; empty if none was chosen."""
-    if not isinstance(state.task, Surveying) or not state.belief.poses:
+    if not isinstance(state.task, Surveying) or not state.posterior.poses:
         return []
     command, ticks = state.task.command, stride(pair.mission)
-    start, pieces = state.belief.poses[0], SEGMENTS_PER_TICK * ticks
+    start, pieces = state.posterior.poses[0], SEGMENTS_PER_TICK * ticks
     times = [ticks * pair.mission.period * i / pieces for i in range(pieces + 1)]
     return [step(start, command.v, command.omega, time) for time in times]

@@ -36,7 +36,7 @@ from agent.estimation.gaussian.planning_hypotheses import (
 )
 from agent.estimation.gaussian.search import search
 from agent.estimation.judged import FEWEST_FOR_CLAIM, Judged, User, of_pair
-from agent.estimation.knowledge import Attempt, Belief, Knowledge
+from agent.estimation.knowledge import Attempt, Knowledge, MeetingPosterior
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, settled
 from protocol.messages import Localised, Undecided, Verdict
 
@@ -45,7 +45,7 @@ class FollowedPair(NamedTuple):
     """The estimate of a pair in one tick."""
 
     measured: JointMeasurements
-    belief: Belief
+    posterior: MeetingPosterior
     hypotheses: tuple[PlanningHypothesis, ...] = ()
     """The hypotheses for planning; the second one is the rival that blocks a claim, if one does."""
     verdict: Verdict | None = None
@@ -59,33 +59,33 @@ def followed(knowledge: Knowledge) -> FollowedPair:
     converge, and before a claim or a suspicion.
     """
     first = beginning(knowledge, knowledge.known_through)
-    measured, belief = pair_of(knowledge), knowledge.belief
-    if first != belief.attempt.beginning:
-        belief = replace(belief, pair=(), hypothesis_counts=None, attempt=Attempt(first))
-        knowledge = replace(knowledge, belief=belief)
+    measured, posterior = pair_of(knowledge), knowledge.posterior
+    if first != posterior.attempt.beginning:
+        posterior = replace(posterior, pair=(), hypothesis_counts=None, attempt=Attempt(first))
+        knowledge = replace(knowledge, posterior=posterior)
     mutual = int(np.count_nonzero(measured.ranges.mutual))
     if mutual < FEWEST_FOR_CLAIM:
-        return FollowedPair(measured, belief)
-    known = settled(Posterior(PAIR, belief.pair), measured)
-    due = any(belief.attempt.ranges_at_last_search < at <= mutual for at in SEARCHED_AT)
+        return FollowedPair(measured, posterior)
+    known = settled(Posterior(PAIR, posterior.pair), measured)
+    due = any(posterior.attempt.ranges_at_last_search < at <= mutual for at in SEARCHED_AT)
     if known.hypotheses and known.has_converged and not due:
-        belief, judged, blocking = believed(knowledge, "assured", known, measured, BEFORE_SEARCH)
+        posterior, judged, blocking = judged_posterior(knowledge, "assured", known, measured, BEFORE_SEARCH)
         test = judged and judged.inconsistency
         if blocking is not None and (test is None or test.p_value >= CLAIM_P_VALUE):
-            return FollowedPair(measured, belief, tuple(map(planning_hypothesis, belief.pair)))
+            return FollowedPair(measured, posterior, tuple(map(planning_hypothesis, posterior.pair)))
     return _searched(knowledge, measured, search(measured, known), mutual)
 
 
-def believed(
+def judged_posterior(
     knowledge: Knowledge,
     user: User,
     found: Posterior,
     measured: JointMeasurements,
     conditions: Sequence[Condition] = CONDITIONS,
-) -> tuple[Belief, Judged | None, Blocked | None]:
-    """Return the belief with the hypotheses `found`, the first one as a claim sees it, and what blocks that.
+) -> tuple[MeetingPosterior, Judged | None, Blocked | None]:
+    """Return the posterior with the hypotheses `found`, the likeliest as a claim sees it, and a block.
 
-    The claim is that of `user`, and the last is the first of the `conditions` that is not met.
+    The claim is that of `user`, and the block is the first of the `conditions` that it does not meet.
     """
     config, scored = knowledge.config, found.hypotheses
     robot, m2 = 0 if config.role == "a" else 1, m2_of(config)
@@ -96,9 +96,9 @@ def believed(
     if judged is not None and user == "assured" and not isinstance(knowledge.peer_state.verdict, Localised):
         judged = judged._replace(rivals_of=(0, 1))
     blocking = blocked(judged, conditions)
-    first, _ = knowledge.belief.hypothesis_counts or (len(scored), 0)
-    belief = replace(
-        knowledge.belief,
+    first, _ = knowledge.posterior.hypothesis_counts or (len(scored), 0)
+    posterior = replace(
+        knowledge.posterior,
         pair=scored,
         poses=tuple([one.pose for one in claims]),
         odometry=knowledge.odometry,
@@ -106,7 +106,7 @@ def believed(
         hypothesis_counts=(first, len(scored)),
         blocking_reason=blocking and blocking.reason,
     )
-    return belief, judged, blocking
+    return posterior, judged, blocking
 
 
 def _searched(
@@ -118,9 +118,9 @@ def _searched(
     Undecided if the robot's own sensors are not as it was told. It is also Undecided if other profiles of the
     sensors contradict all of its latest claims: then more ranges have not helped.
     """
-    belief, judged, blocking = believed(knowledge, "assured", found, measured)
-    hypotheses, test = tuple(map(planning_hypothesis, belief.pair)), judged and judged.inconsistency
-    attempt = replace(belief.attempt, ranges_at_last_search=mutual)
+    posterior, judged, blocking = judged_posterior(knowledge, "assured", found, measured)
+    hypotheses, test = tuple(map(planning_hypothesis, posterior.pair)), judged and judged.inconsistency
+    attempt = replace(posterior.attempt, ranges_at_last_search=mutual)
     p_values = [attempt.p_value, test.p_value if test is not None else None]
     least = min([one for one in p_values if one is not None], default=None)
     verdict: Verdict | None = None
@@ -135,14 +135,14 @@ def _searched(
             pass
         case None:
             attempt = replace(attempt, doubtful_claims=0, p_value=least)
-            verdict = Localised(belief.poses[0], belief.covariance)
+            verdict = Localised(posterior.poses[0], posterior.covariance)
         case Blocked(condition, reason) if condition is profiles:
             attempt = replace(attempt, doubtful_claims=attempt.doubtful_claims + 1)
             verdict = Undecided(reason) if attempt.doubtful_claims >= DOUBTFUL_CLAIMS else None
         case Blocked(condition) if condition is rivals:
             attempt = replace(attempt, doubtful_claims=0)
             hypotheses = (hypotheses[0], judged.rival.hypothesis, *hypotheses[1:])
-    return FollowedPair(measured, replace(belief, attempt=attempt), hypotheses, verdict)
+    return FollowedPair(measured, replace(posterior, attempt=attempt), hypotheses, verdict)
 
 
 # --- after the claim ----------------------------------------------------------------------------------
@@ -155,7 +155,7 @@ def followed_later(
 
     The whole plane is searched if the `known` hypotheses do not explain it, or if `searched`.
     """
-    found = settled(Posterior(PAIR, known.belief.pair), measured)
+    found = settled(Posterior(PAIR, known.posterior.pair), measured)
     judged = None if searched else of_pair(user, known.config, found.hypotheses, measured)
     if blocked(judged, (convergence, consistency)) is not None:
         found = settled(search(measured, found), measured)

@@ -12,7 +12,7 @@ from agent.estimation.closed_forms import Placement
 from agent.estimation.estimator import AnchorEstimate, Estimator, PairEstimate
 from agent.estimation.exact import Branch
 from agent.estimation.fit import Fit
-from agent.estimation.gaussian.followed_pair import believed
+from agent.estimation.gaussian.followed_pair import judged_posterior
 from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.gaussian.own_anchor import followed
 from agent.estimation.gaussian.search import search
@@ -76,13 +76,13 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         if knowledge.known_through < knowledge.tick or mutual < FEWEST_MUTUAL_RANGES:
             return None
         found = search(measured, fewest=FEWEST_MUTUAL_RANGES)
-        belief, judged, blocking = believed(knowledge, "paper", found, measured)
-        failure = f"the paper's manoeuvres give no further ranges: {belief.blocking_reason}"
+        posterior, judged, blocking = judged_posterior(knowledge, "paper", found, measured)
+        failure = f"the paper's manoeuvres give no further ranges: {posterior.blocking_reason}"
         verdict: Verdict | None = Undecided(failure)
         if judged is not None:
-            verdict = Localised(belief.poses[0], belief.covariance) if blocking is None else None
-        placements = tuple([_pose_in_b_frame(one.fit) for one in belief.pair])
-        return PairEstimate(belief, verdict, placements, failure)
+            verdict = Localised(posterior.poses[0], posterior.covariance) if blocking is None else None
+        placements = tuple([_pose_in_b_frame(one.fit) for one in posterior.pair])
+        return PairEstimate(posterior, verdict, placements, failure)
 
 
 def _pose_in_b_frame(fit: Fit) -> Placement:
