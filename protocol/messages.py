@@ -46,10 +46,10 @@ from msgspec import Meta
 from msgspec.structs import force_setattr
 
 from protocol.attack import Attack
+from protocol.coverage_strips import SweptArea, widest_distance
 from protocol.mission import HEADING_ACCURACY, Anchor, Mission, Options, PlannerName, Role
 from protocol.motion import Controls, Covariance, Pose, Segment
 from protocol.orbits import Orbit, Rendezvous, visiting
-from protocol.sweep_strips import SweptArea, widest_distance
 from protocol.units import (
     Angle,
     AngularVelocity,
@@ -458,7 +458,7 @@ class RobotConfig(OfPair, Message, frozen=True, dict=True):
     sweep: SweptArea | None = None
     """The area in which they are, and the number of its parts; None if there are none."""
     part: Count = 0
-    """The part that this robot sweeps first, after its visits."""
+    """The part that this robot covers first, after its visits."""
     team: Team | None = None
     """The robots with which it shares all measurements; None in a pair or a group."""
     ranges: Annotated[tuple[RobotId, ...], Meta(max_length=MAX_MEMBERS)] = ()
@@ -478,7 +478,7 @@ class RobotConfig(OfPair, Message, frozen=True, dict=True):
         if (self.given_anchor is None) != (self.robot in self.unanchored):
             raise ValueError("anchor: only the robots in unanchored have none")
         if bool(self.unanchored) != (self.sweep is not None) or (self.unanchored and not self.members):
-            raise ValueError("unanchored: such robots need members, and a sweep that finds them")
+            raise ValueError("unanchored: such robots need members, and an area in which they are found")
 
     @property
     def peer_anchor(self) -> Anchor:
@@ -499,7 +499,7 @@ class RobotConfig(OfPair, Message, frozen=True, dict=True):
     def widest_distance(self) -> float:
         """The largest distance in m between the anchors of two robots that may meet.
 
-        The corners of the swept area count, too: the poses of robots in it follow from those of robots with
+        The corners of the covered area count, too: the poses of robots in it follow from those of robots with
         an anchor.
         """
         places = [(one.anchor.x, one.anchor.y) for one in self.members]
@@ -670,7 +670,7 @@ class Report(Message, frozen=True):
     """The sender's pose, for a receiver without an anchor; None to others."""
     strips: tuple[Count, Count] | None = None
     """The strips that the sender has still to begin: the first, and the one after the last. None if it leaves
-    none to other robots: under noise, where robots may report false data, and where it does not sweep."""
+    none to other robots: under noise, where robots may report false data, and where it covers no area."""
     body: Annotated[bytes, Meta(max_length=MAX_BODY_BYTES)] | None = None
     """The value that `Planner.report` returns, in msgpack; None from the shipped planners."""
 

@@ -9,12 +9,12 @@ import math
 from collections.abc import Iterable
 from functools import lru_cache
 
+from protocol.coverage_strips import Place
+from protocol.coverage_ticks import way_ticks
 from protocol.messages import TeamAnchor
 from protocol.mission import Mission
 from protocol.motion import TAU, Controls
 from protocol.orbits import Orbit
-from protocol.sweep_strips import Place
-from protocol.sweep_ticks import way_ticks
 
 LOOP_RADII = (0.2, 0.14, 0.17)
 """The radii of the loops of consecutive robots in units of R. Their turns alternate, too.

@@ -77,7 +77,7 @@ def of_robots(step_: Step) -> list[Report]:
 
 
 def of_finders(run: Run) -> list[float]:
-    """Return the normalised errors squared of the poses that sweeping robots have reported."""
+    """Return the normalised errors squared of the poses that covering robots have reported."""
     ids = [robot.id for robot in run.scenario.robots]
     return [
         nees(one.pose, run.ticks[one.tick].world.truth.poses[ids.index(report.robot)], one.covariance)
@@ -237,7 +237,7 @@ def three_and_one() -> dict[str, Any]:
 
 
 def in_search(run: Run, peers: tuple[str, ...], shift: float) -> RobotState | None:
-    """Return the state of a when it begins to sweep; None if it does not, because its claim is withdrawn.
+    """Return the state of a when it begins to cover; None if it does not, because its claim is withdrawn.
 
     Before it claims its pose with c, the pose that it knows is from its meetings with `peers`, and `shift` m
     beside the one that it has computed.
@@ -252,7 +252,7 @@ def in_search(run: Run, peers: tuple[str, ...], shift: float) -> RobotState | No
             fix = replace(fix, peers=peers, claim=replace(fix.claim, pose=pose))
             state, changed = state.with_agenda(fix=fix), True
         state = planner.decide(state, of_robots(one))
-        if state.sweeps:
+        if state.covers:
             return state
     return None
 
@@ -289,7 +289,7 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     assert (state.agenda.own_pose.reference is not None) == (shift == 0.0)
     if shift == 0.0 or len(peers) > 1:
         assert isinstance(planner.command(state).verdict, Localised)
-        assert state.sweeps
+        assert state.covers
         return
     command = planner.command(state)
     assert command.verdict is None
@@ -367,7 +367,7 @@ def test_odometry_noise_that_leaves_a_finder_too_inaccurate_is_refused_with_the_
     kind: str,
 ) -> None:
     sigma = 0.2
-    message = r"^group.toml: mission.noise.odometry: between two passages of its anchor, a robot that sweeps"
+    message = r"^group.toml: mission.noise.odometry: between two passages of its anchor, a robot that covers"
     with pytest.raises(UserError, match=message) as refused:
         noisy(four(), odometry={kind: sigma})
     share = float(re.findall(r"reduce this noise to (\S+) of it", str(refused.value))[0])

@@ -17,10 +17,10 @@ from msgspec.structs import replace
 from playwright.sync_api import expect
 
 from agent.planning.agenda import Agenda
+from agent.planning.coverage import second_half, strips, without_strips
 from agent.planning.group import GroupPlanner
 from agent.planning.state import RobotState
-from agent.planning.sweep import second_half, strips, without_strips
-from agent.planning.tasks import Looping, Sweeping
+from agent.planning.tasks import Covering, Looping
 from agent.planning.unanchored import UnanchoredPlanner
 from compose.audit.rules import audit_run, replayed
 from compose.errors import UserError
@@ -30,6 +30,7 @@ from compose.recording.reasons import reason_for
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames, read
 from compose.scenario.scenario_file import load, parse, validate
+from protocol.coverage_strips import SweptArea
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
     Command,
@@ -41,7 +42,6 @@ from protocol.messages import (
     TickStart,
 )
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
-from protocol.sweep_strips import SweptArea
 from protocol.wire import decode, encode
 from tests.browser import Open, scrub_to, shot, watching
 from tests.commands import tandem as tandem_command
@@ -168,7 +168,7 @@ def test_a_finder_and_the_robot_that_it_has_found_sweep_each_strip_once(
     area, ends = SweptArea(0.0, 0.0, 300.0, 300.0, parts), (first, first + more)
     config = replace(scenario_of(four()).config("u"), sweep=area)
     whole = area.path(ends, R)
-    finder = RobotState(config, task=Sweeping(whole), agenda=Agenda(strips_end=ends[1]))
+    finder = RobotState(config, task=Covering(whole), agenda=Agenda(strips_end=ends[1]))
     told = strips(finder)
     assert told == ends
     beyond = (first, area.strips(R) + more)
@@ -181,7 +181,7 @@ def test_a_finder_and_the_robot_that_it_has_found_sweep_each_strip_once(
     assert strips(stopped) == ends
     found = second_half(RobotState(config), told)
     left = without_strips(finder, strips(found))
-    assert isinstance(left.task, Sweeping)
+    assert isinstance(left.task, Covering)
     taken = found.task.then[1:] if isinstance(found.task, Looping) else ()
     assert left.task.places + taken == whole
     assert len(taken) == 2 * (more // 2)

@@ -19,6 +19,7 @@ from msgspec.structs import replace
 
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
+from protocol.coverage_strips import SweptArea
 from protocol.messages import (
     MAX_REPORT_RANGES,
     MAX_REPORT_RUNS,
@@ -32,7 +33,6 @@ from protocol.messages import (
     RobotConfig,
 )
 from protocol.mission import Mission
-from protocol.sweep_strips import SweptArea
 from protocol.wire import MAX_FRAME_BYTES, VERSION, MalformedFrame, decode, encode
 from tests.examples import CONFIG, EXAMPLES
 from world.scenario import Scenario

@@ -1,4 +1,4 @@
-"""The localisation of robots without an anchor from ranges, and the sweep in which they are found."""
+"""The localisation of robots without an anchor from ranges, and the coverage in which they are found."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.estimation.resection import RangedPlace, is_certain, is_fixed, poses, positions
-from agent.planning import drive, sweep
+from agent.planning import coverage, drive
 from agent.planning.state import RobotState
-from agent.planning.tasks import Looping, Sweeping
+from agent.planning.tasks import Covering, Looping
 from compose.scenario.scenario_file import load
+from protocol.coverage_strips import SIDE, STRIP_REACH, SweptArea
+from protocol.coverage_ticks import way_ticks
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, Pose, compose, step
-from protocol.sweep_strips import SIDE, STRIP_REACH, SweptArea
-from protocol.sweep_ticks import way_ticks
 from tests.groups import R
 
 FLOOR = 1e-9
@@ -87,7 +87,7 @@ def test_ranges_along_one_straight_do_not_determine_a_heading_on_the_line_of_sig
     assert not is_certain(standing, moved, found)
 
 
-# --- the sweep ----------------------------------------------------------------------------------------
+# --- the coverage ----------------------------------------------------------------------------------------
 
 LENGTHS = st.floats(0.0, 40.0)
 
@@ -95,10 +95,10 @@ LENGTHS = st.floats(0.0, 40.0)
 def driven(places: tuple[tuple[float, float], ...], start: Pose, mission: Mission = MISSION) -> list[Pose]:
     """Return the poses of each tick of a robot that drives to `places`, one after the other."""
     path, config = [start], replace(load("paper-1").config("a"), mission=mission)
-    task: Sweeping | Looping = Sweeping(places)
+    task: Covering | Looping = Covering(places)
     while True:
         state = RobotState(config, odometry=path[-1])
-        task = sweep.onward(state, task)
+        task = coverage.onward(state, task)
         if not task.places:
             return path
         driven = drive.controls(state.doing(task))

@@ -12,6 +12,7 @@ import msgspec
 from msgspec import Meta
 
 from protocol.attack import Attack
+from protocol.coverage_strips import SweptArea
 from protocol.messages import (
     MAX_MEMBERS,
     Appointment,
@@ -24,7 +25,6 @@ from protocol.messages import (
 )
 from protocol.mission import Anchor, Mission, Options, PlannerName
 from protocol.motion import Pose
-from protocol.sweep_strips import SweptArea
 from protocol.units import Clearance, RobotId, Tick, Time
 from world.faults import Fault
 from world.radio_models import RADIO_MODELS
@@ -74,13 +74,13 @@ class PlannedMeeting(msgspec.Struct, frozen=True, array_like=True, forbid_unknow
     """The bound in s of the time at which both are localised."""
 
 
-class PlannedSweep(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
+class PlannedCoverage(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
     """The search of localised robots for those without an anchor."""
 
     sweep: SweptArea
     """The area, and the number of its parts."""
     sweepers: tuple[RobotId, ...]
-    """The robots that sweep it, in the order of the parts that they sweep first."""
+    """The robots that cover it, in the order of the parts that they cover first."""
     ends: Time
     """The bound in s of the time at which all robots without an anchor are localised."""
 
@@ -166,7 +166,7 @@ class Scenario(
     """The robots of a group that die, in the order of the scenario."""
     tolerates: Annotated[int, Meta(ge=0, le=MAX_MEMBERS)] = 0
     """The number of robots of a group that may report false data."""
-    planned_sweep: PlannedSweep | None = None
+    planned_sweep: PlannedCoverage | None = None
     """The search for robots without an anchor; None if all robots have one."""
     confirmation: PlannedConfirmation | None = None
     """The meetings that confirm poses; None if robots claim the pose that they know."""

@@ -37,7 +37,7 @@ class Other(msgspec.Struct, frozen=True):
 
 
 class OwnPose(msgspec.Struct, frozen=True):
-    """The latest estimates of its own pose that a sweeping robot with noisy sensors has made."""
+    """The latest estimates of its own pose that a covering robot with noisy sensors has made."""
 
     estimated_tick: int | None = None
     """The tick of the latest estimate; None if the next one is due at once."""
@@ -131,7 +131,7 @@ class Agenda(msgspec.Struct, frozen=True):
     framed_at: Pose = ORIGIN
     """The odometry where `frame` was determined. An error of its heading turns ways about this place."""
     own_pose: OwnPose = OwnPose()
-    """The accuracy of its pose while it sweeps, with noisy sensors."""
+    """The accuracy of its pose while it covers an area, with noisy sensors."""
     others: Mapping[str, Other] = {}
     """The knowledge about each robot that this one has been in range of, or heard of."""
     visits: int = 0
@@ -139,11 +139,11 @@ class Agenda(msgspec.Struct, frozen=True):
     retries: int = 0
     """The number of retries whose time has come."""
     parts: int = 0
-    """The number of parts of an area that the robot has begun to sweep for robots without an anchor."""
+    """The number of parts of an area that the robot has begun to cover for robots without an anchor."""
     part_tick: int = -1
     """The tick in which it began the latest of them."""
     strips_end: int | None = None
-    """The strip after the last one of its sweep; None if it does not leave strips to others."""
+    """The strip after the last one of its coverage; None if it does not leave strips to others."""
     until: float | None = None
     """The time in s at which the search of a retry ends; None if there is none."""
     alone: bool = False

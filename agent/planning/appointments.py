@@ -1,4 +1,4 @@
-"""The appointments of a robot of a group, in their order: visits, retries, a sweep, and its own anchor."""
+"""The appointments of a robot of a group, in their order: visits, retries, coverage, and its own anchor."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ PEER_LOST_AFTER = 200
 def next_visit(state: RobotState) -> RobotState:
     """Return `state` on the way to the next robot; as it is if there is none.
 
-    After the planned visits, and after its part of a sweep, it is the nearest one that should be localised by
-    now, and has not reported it; of those that were not beside their anchors, the one for which that was
-    longest ago. After all these, the robot sweeps the parts of others.
+    After the planned visits and its part of the area, it is the nearest one that should be localised by now,
+    and has not reported it; of those that were not beside their anchors, the one for which that was longest
+    ago. After all these, the robot covers the parts of others.
     """
     visits, config = state.agenda.visits, state.config
     while visits < len(config.visits):

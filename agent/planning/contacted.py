@@ -17,14 +17,14 @@ from agent.estimation.gaussian.beacon_guesses import FEWEST_FOR_POSE
 from agent.estimation.gaussian.contact_fit import ContactEstimate, contact_measurements, estimated
 from agent.estimation.gaussian.mission_measurements import path_of
 from agent.peer.motion_log import MotionLog
-from agent.planning import sweep
+from agent.planning import coverage
 from agent.planning.planner import Summary
 from agent.planning.state import RobotState
-from agent.planning.tasks import Awaiting, Done, Looping, Standing, Sweeping
+from agent.planning.tasks import Awaiting, Covering, Done, Looping, Standing
+from protocol.coverage_strips import OWN_SIDE
+from protocol.coverage_ticks import contact_ticks
 from protocol.messages import Estimate, Localised, Report
 from protocol.motion import Covariance, Pose
-from protocol.sweep_strips import OWN_SIDE
-from protocol.sweep_ticks import contact_ticks
 
 EACH = 3
 """The number of further ranges, and of ticks, after which the pose is estimated again.
@@ -72,7 +72,7 @@ class Contacted(msgspec.Struct, frozen=True):
                 log = MotionLog(through=prior.tick)
                 finder = Finder(report.robot, prior.tick, prior.pose, prior.covariance, log, report.tick)
                 found = _with_finder(state, found, finder, report)
-            elif found.finder is None and report.state == Sweeping.name:
+            elif found.finder is None and report.state == Covering.name:
                 why = f"{report.robot} has passed it, and does not know its own pose well enough"
                 found = replace(found, failure=why)
         found, claim = _estimated(state, found)
@@ -181,10 +181,10 @@ def _moved_on(state: RobotState, found: Contacted) -> RobotState:
     if finder.covariance.position_sigma > mission.accuracy:
         return state.doing(Standing())
     if isinstance(state.task, Looping):
-        moved = sweep.onward(state, state.task)
+        moved = coverage.onward(state, state.task)
         if moved.places and isinstance(moved, Looping):
             return state.doing(moved)
     if finder.latest <= state.tick - contact_ticks(mission) // 2:
         return state.doing(Standing())
     side = OWN_SIDE * mission.sensing_range
-    return state.doing(sweep.looping_both_ways(state, side, side, state.tick))
+    return state.doing(coverage.looping_both_ways(state, side, side, state.tick))

@@ -8,11 +8,11 @@ from agent.planning import tasks
 from agent.planning.separation import leeway
 from agent.planning.state import RobotState
 from agent.planning.tasks import Beacon
+from protocol.coverage_strips import Place
+from protocol.coverage_ticks import coverage_speed
 from protocol.mission import Mission
 from protocol.motion import REST, TAU, Controls, Pose, relative, travelled, wrap
 from protocol.orbits import Orbit
-from protocol.sweep_strips import Place
-from protocol.sweep_ticks import sweep_speed
 
 ASIDE = 1e-9
 """The distance from a place at which a straight to it may end beside it, as a fraction of A_0."""
@@ -55,9 +55,9 @@ def controls(state: RobotState) -> Controls:
             return task.command
         case tasks.Homing(place) | tasks.Travelling(place):
             return way_to(state, place, backward=isinstance(task, tasks.Homing)) or REST
-        case tasks.Sweeping((place, *_)) | tasks.Looping((place, *_)):
+        case tasks.Covering((place, *_)) | tasks.Looping((place, *_)):
             way = way_to(state, place) or REST
-            return Controls(min(way.v, sweep_speed(mission)), way.omega)
+            return Controls(min(way.v, coverage_speed(mission)), way.omega)
         case _:
             return REST
 

@@ -148,7 +148,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         heard = plausibility.with_reports(state, of_peer, self.pair_planner.rendezvous)
         if heard.verdict == state.verdict:
             state = heard
-        return meetings.onward(state) if state.sweeps else state
+        return meetings.onward(state) if state.covers else state
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the robot's verdict."""

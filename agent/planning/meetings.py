@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import appointments, searching, sweep, visit
+from agent.planning import appointments, coverage, searching, visit
 from agent.planning.agenda import Fix
 from agent.planning.state import RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
@@ -27,9 +27,9 @@ def with_sender(state: RobotState, report: Report) -> RobotState:
     """Return `state` with what `report` says about its sender: whether it travels, is localised or served.
 
     If poses have to be confirmed, a robot that travels need not have claimed its own. Strips that the sender
-    sweeps are not swept by this robot.
+    covers are not covered by this robot.
     """
-    state = sweep.without_strips(state, report.strips)
+    state = coverage.without_strips(state, report.strips)
     known, confirms = state.other(report.robot), state.config.confirms
     travels = report.state == Travelling.name
     claims = not report.has_log and isinstance(report.verdict, Localised)
@@ -87,17 +87,17 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
     return appointments.withdrawn(state, other, Undecided(why))
 
 
-def _on_sweep(state: RobotState) -> RobotState:
-    """Return `state` after a tick of a sweep: on the next visit at its end, or without its claim.
+def _while_covering(state: RobotState) -> RobotState:
+    """Return `state` after a tick of the coverage: on the next visit at its end, or without its claim.
 
     Without it, the robot waits for another one than its peer.
     """
     agenda, peer = state.agenda, state.config.peer
     assert agenda.robot_verdict is not None
-    swept, done = searching.swept(state), Done(state.phase, agenda.robot_verdict)
-    if swept.verdict is None:
-        return appointments.next_visit(swept.doing(done)) if sweep.is_over(swept) else swept
-    return appointments.waiting(appointments.withdrawn(swept, peer, swept.verdict), peer)
+    covered, done = searching.after_tick(state), Done(state.phase, agenda.robot_verdict)
+    if covered.verdict is None:
+        return appointments.next_visit(covered.doing(done)) if coverage.is_over(covered) else covered
+    return appointments.waiting(appointments.withdrawn(covered, peer, covered.verdict), peer)
 
 
 def after_refusal(state: RobotState) -> RobotState:
@@ -122,8 +122,8 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
         return appointments.waiting(parted, peer) if over else state
     if agenda.fix is None:
         return appointments.after_failure(state)
-    if state.sweeps:
-        return _on_sweep(state)
+    if state.covers:
+        return _while_covering(state)
     if agenda.visiting and state.verdict is None:
         if state.other(peer).localised and agenda.robot_verdict is not None:  # by another robot
             return appointments.next_visit(state)

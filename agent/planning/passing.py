@@ -19,10 +19,10 @@ from agent.planning import drive, phase2_orbit, separation, visit
 from agent.planning.agenda import Bypass
 from agent.planning.state import RobotState
 from agent.planning.tasks import Orbital, Orbiting, Travelling, transformed
+from protocol.coverage_strips import Place
 from protocol.messages import Contact
 from protocol.mission import Mission
 from protocol.motion import Controls, Pose, compose
-from protocol.sweep_strips import Place
 
 RESERVE = 0.05
 """The way that a robot leaves unused, as a fraction of A_0, except on a way aside, which uses it.

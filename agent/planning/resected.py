@@ -18,10 +18,10 @@ from msgspec.structs import replace
 
 from agent.estimation import resection
 from agent.estimation.resection import RangedPlace
-from agent.planning import sweep
+from agent.planning import coverage
+from agent.planning.coverage import LOOPS_FOR
 from agent.planning.planner import Summary
 from agent.planning.state import RobotState
-from agent.planning.sweep import LOOPS_FOR
 from agent.planning.tasks import UNCONFIRMED, Awaiting, Done, Looping, Standing
 from protocol.messages import Estimate, Localised, Report
 from protocol.motion import ORIGIN, Pose, compose, inverse, wrap
@@ -126,7 +126,7 @@ def _resected(state: RobotState, found: Resected) -> tuple[RobotState, Resected]
         if not isinstance(state.task, Looping):
             positions = resection.positions(standing, LARGEST_MISFIT)
             if len(positions) == 1 and resection.is_fixed(standing, positions[0]):
-                return state.doing(sweep.looping(state, state.tick)), found
+                return state.doing(coverage.looping(state, state.tick)), found
         elif moved and (hypotheses := resection.poses(standing, moved, LARGEST_MISFIT)):
             found = replace(found, hypotheses=hypotheses)
             if resection.is_certain(standing, moved, hypotheses):
@@ -163,11 +163,11 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     """
     if not isinstance(state.task, Looping):
         return state.doing(Standing() if found.places or found.unconfirmed else Awaiting())
-    task = sweep.onward(state, state.task)
+    task = coverage.onward(state, state.task)
     if task.places:
         return state.doing(task)
     latest = max([tick for robot, tick in found.places if robot not in found.unconfirmed], default=-KEPT)
     if latest > state.tick - KEPT and state.task.since > state.tick - LOOPS_FOR:
-        return state.doing(sweep.looping(state, state.task.since))
+        return state.doing(coverage.looping(state, state.task.since))
     found = Resected(state.odometry, state.tick, unconfirmed=found.unconfirmed)
     return state.doing(Standing() if found.unconfirmed else Awaiting()).with_agenda(found=found)

@@ -1,6 +1,6 @@
-"""A localised robot that looks for robots without an anchor: which part it sweeps, and what it tells them.
+"""A localised robot that looks for robots without an anchor: which part it covers, and what it tells them.
 
-How it finds them depends on its sensors: see `sweep`, and `beacon_sweep` with noisy ones.
+How it finds them depends on its sensors: see `coverage`, and `beacon_coverage` with noisy ones.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 from msgspec.structs import replace
 
-from agent.planning import beacon_sweep, exchange, sweep
+from agent.planning import beacon_coverage, coverage, exchange
 from agent.planning.contacted import Contacted
 from agent.planning.resected import Resected
 from agent.planning.state import RobotState
 from protocol.messages import Localised, Report
 
 
-class SweepSteps(NamedTuple):
+class CoverageSteps(NamedTuple):
     """The steps of the search for robots without an anchor that depend on the sensors: chosen once."""
 
     found: Resected | Contacted
@@ -25,21 +25,28 @@ class SweepSteps(NamedTuple):
     with_pose: Callable[[RobotState, str, Report], Report]
     """The function that adds the robot's pose to its report to one without an anchor, if it may state it."""
     begun: Callable[[RobotState, int], RobotState]
-    """The function that begins the sweep of a part of the area."""
+    """The function that begins the coverage of a part of the area."""
     after_tick: Callable[[RobotState, Sequence[str]], RobotState]
-    """The function that advances a sweep by a tick, with the robots that it may help."""
+    """The function that advances the coverage by a tick, with the robots that it may help."""
     beacon: Callable[[RobotState], str | None]
-    """The function that returns the robot which stays where it is, so that one that sweeps knows its pose:
-    that robot's latest peer, or this robot; None if there is none."""
+    """The function that returns the beacon of a robot that covers an area: its latest peer, or this robot.
+
+    None if there is none."""
 
 
-DEAD_RECKONED = SweepSteps(Resected(), sweep.with_pose, sweep.begun, sweep.after_tick, lambda _: None)
-CORRECTED = SweepSteps(
-    Contacted(), beacon_sweep.with_pose, beacon_sweep.begun, beacon_sweep.after_tick, beacon_sweep.beacon
+DEAD_RECKONED = CoverageSteps(
+    Resected(), coverage.with_pose, coverage.begun, coverage.after_tick, lambda _: None
+)
+CORRECTED = CoverageSteps(
+    Contacted(),
+    beacon_coverage.with_pose,
+    beacon_coverage.begun,
+    beacon_coverage.after_tick,
+    beacon_coverage.beacon,
 )
 
 
-def steps_of(state: RobotState) -> SweepSteps:
+def steps_of(state: RobotState) -> CoverageSteps:
     """Return the steps for the sensors of the mission."""
     return CORRECTED if state.estimator.corrects_poses else DEAD_RECKONED
 
@@ -67,29 +74,29 @@ def takes_part(state: RobotState) -> bool:
 
 
 def beacon(state: RobotState) -> str | None:
-    """Return the robot that stays where it is for one that sweeps: the peer, this robot, or None."""
+    """Return the robot that stays where it is for one that covers an area: the peer, this robot, or None."""
     return steps_of(state).beacon(state)
 
 
 def is_apart(state: RobotState) -> bool:
-    """Return whether the robot is in no meeting any more: it sweeps, or is the beacon of one that does."""
-    return state.sweeps or beacon(state) == state.config.robot
+    """Return whether the robot is in no meeting any more: it covers an area, or is a beacon."""
+    return state.covers or beacon(state) == state.config.robot
 
 
 def outside_meeting(state: RobotState, peer: str) -> Report:
-    """Return the report to `peer` outside a meeting: this robot's verdict, and the strips that it sweeps.
+    """Return the report to `peer` outside a meeting: this robot's verdict, and the strips that it covers.
 
     A robot without an anchor gets the pose of a localised one until it has determined its own by it.
     """
     verdict = state.agenda.robot_verdict
-    report = replace(exchange.report_without_log(state, verdict), strips=sweep.strips(state))
+    report = replace(exchange.report_without_log(state, verdict), strips=coverage.strips(state))
     if not (is_helped(state, peer) and isinstance(verdict, Localised)):
         return report
     return steps_of(state).with_pose(state, peer, report)
 
 
 def next_part(state: RobotState) -> RobotState:
-    """Return `state` of a localised robot that sweeps the next part of the area, its own one first.
+    """Return `state` of a localised robot that covers the next part of the area, its own one first.
 
     It stops again for robots that it has left before.
     """
@@ -104,8 +111,8 @@ def next_part(state: RobotState) -> RobotState:
     return steps_of(state).begun(state, part)
 
 
-def swept(state: RobotState) -> RobotState:
-    """Return `state` after a tick of a sweep, or of a contact with robots without an anchor.
+def after_tick(state: RobotState) -> RobotState:
+    """Return `state` after a tick of the coverage, or of a contact with robots without an anchor.
 
     Those that are localised do not count, nor those with which a contact has failed.
     """

@@ -12,7 +12,7 @@ from agent.estimation.gaussian.gaussian_estimator import GAUSSIAN
 from agent.estimation.knowledge import Knowledge
 from agent.planning.agenda import Agenda, Other
 from agent.planning.phase3_last_manoeuvre import Plan
-from agent.planning.tasks import Asleep, Done, Looping, Sweeping, Task
+from agent.planning.tasks import Asleep, Covering, Done, Looping, Task
 from protocol.messages import Localised, Undecided, Verdict
 from protocol.motion import ORIGIN, Pose, compose, inverse
 
@@ -58,17 +58,17 @@ class RobotState(Knowledge, frozen=True):
         """Return whether the robot meets visitors: it knows no pose yet, or is back at its anchor."""
         if self.agenda.fix is None:
             return self.agenda.robot_verdict is None
-        return not (self.agenda.visiting or self.sweeps) and self.verdict is None
+        return not (self.agenda.visiting or self.covers) and self.verdict is None
 
     @property
     def meets(self) -> bool:
         """Return whether the robot exchanges logs with its peer, if they are in contact."""
-        return not (self.agenda.alone or self.sweeps)
+        return not (self.agenda.alone or self.covers)
 
     @property
-    def sweeps(self) -> bool:
-        """Return whether the robot sweeps an area, or has stopped for a robot without an anchor."""
-        return isinstance(self.task, Sweeping | Looping)
+    def covers(self) -> bool:
+        """Return whether the robot covers an area, or has stopped for a robot without an anchor."""
+        return isinstance(self.task, Covering | Looping)
 
     @property
     def elapsed(self) -> float:

@@ -11,9 +11,9 @@ from typing import ClassVar, Literal
 import msgspec
 
 from agent.estimation.exact import Branch
+from protocol.coverage_strips import Place
 from protocol.messages import Inconsistent, Localised, Verdict
 from protocol.motion import REST, Controls, Pose, compose
-from protocol.sweep_strips import Place
 
 Beacon = Literal["anchor", "peer"]
 
@@ -171,7 +171,7 @@ def transformed(transform: Pose, places: Iterable[Place]) -> tuple[Place, ...]:
     return tuple([(one.x, one.y) for one in moved])
 
 
-class Sweeping(msgspec.Struct, frozen=True):
+class Covering(msgspec.Struct, frozen=True):
     """A localised robot of a group drives along the strips in which it looks for robots without an anchor."""
 
     name: ClassVar[str] = "sweeping"
@@ -261,7 +261,7 @@ class Looping(msgspec.Struct, frozen=True):
     places: tuple[Place, ...]
     """The corners that are left, in m in the frame of the odometry. The last one is where it began."""
     then: tuple[Place, ...] = ()
-    """The ends of the straights of a sweep that are left after it."""
+    """The ends of the straights of the coverage that are left after it."""
     since: int = 0
     """The tick in which the first loop began; it is repeated until a robot is localised."""
 
@@ -296,7 +296,7 @@ class Done(msgspec.Struct, frozen=True):
 
 Task = (
     Asleep | Searching | Surveying | ThirdPoint | Homing
-    | Orbital | Travelling | Sweeping | Awaiting
+    | Orbital | Travelling | Covering | Awaiting
     | Resting | LastManoeuvre | Returning | Listening | Retreating | Looping
     | Deciding | Done
 )  # fmt: skip

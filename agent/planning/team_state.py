@@ -19,11 +19,11 @@ from agent.estimation.posterior import Hypothesis, certainties, same
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import TeamLog
 from agent.planning.agenda import Bypass
+from protocol.coverage_strips import Place
 from protocol.messages import Localised, RobotConfig, SurveyedAnchor, Team, Undecided, Verdict
 from protocol.mission import Anchor
 from protocol.motion import ORIGIN, REST, Controls, Pose, compose, relative, wrap
 from protocol.orbits import Orbit
-from protocol.sweep_strips import Place
 
 UNMET = "it has reported nothing"
 """The reason against a claim by the measurements of a robot that there are none of."""

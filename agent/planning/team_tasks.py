@@ -24,10 +24,10 @@ from agent.planning.drive import pursuit, towards
 from agent.planning.passing import limited, passed
 from agent.planning.strides import stride
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
+from protocol.coverage_ticks import coverage_speed
 from protocol.messages import Undecided
 from protocol.motion import REST, TAU, Controls, Pose
 from protocol.orbits import Orbit
-from protocol.sweep_ticks import sweep_speed
 from protocol.team_motion import loop, loop_ticks, nearest_other, spiral, way_past
 
 ARRIVED = 0.01
@@ -113,7 +113,7 @@ def _searching(state: TeamState) -> TeamState | None:
     if state.config.robot != state.team.origin:
         return state.doing_next("waiting", None)
     mission, here, (corner, place) = state.config.mission, state.odometry, state.spiral
-    corners, v = spiral(mission, state.team.diameter), sweep_speed(mission)
+    corners, v = spiral(mission, state.team.diameter), coverage_speed(mission)
     if math.hypot(here.x - place[0], here.y - place[1]) <= (1.0 + ARRIVED) * v * mission.period:
         place = here.x, here.y
     for k in (corner, corner + 1):

@@ -14,13 +14,13 @@ from msgspec.structs import replace
 from agent.estimation.claim import is_definite
 from agent.estimation.compiled import library
 from agent.estimation.judged import sufficient_mutual_ranges
-from agent.planning import meetings, searching, sweep
+from agent.planning import coverage, meetings, searching
 from agent.planning.contacted import Contacted
 from agent.planning.exchange import LogPlanner
 from agent.planning.planner import Summary
 from agent.planning.resected import Resected
 from agent.planning.state import RobotState
-from agent.planning.tasks import Awaiting, Done, Sweeping
+from agent.planning.tasks import Awaiting, Covering, Done
 from protocol.messages import Estimate, Localised, Report, RobotConfig
 from protocol.mission import Mission
 
@@ -90,12 +90,12 @@ def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:
         state = meetings.with_sender(state, one)
     if state.agenda.parts == 0:
         offered = [one.strips for one in reports if one.strips is not None]
-        state = sweep.second_half(state, offered[0]) if offered else state
-    if any(one.prior is not None for one in reports) and not isinstance(state.task, Sweeping):
+        state = coverage.second_half(state, offered[0]) if offered else state
+    if any(one.prior is not None for one in reports) and not isinstance(state.task, Covering):
         return state
-    if state.sweeps:
-        state = searching.swept(state)
-        if not sweep.is_over(state):
+    if state.covers:
+        state = searching.after_tick(state)
+        if not coverage.is_over(state):
             return state
         assert state.agenda.robot_verdict is not None
         state = state.doing(Done(3, state.agenda.robot_verdict))

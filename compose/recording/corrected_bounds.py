@@ -14,9 +14,9 @@ from collections.abc import Collection, Sequence
 import msgspec
 
 from compose.recording.run import Run
+from protocol.coverage_strips import Place, widest_distance
+from protocol.coverage_ticks import ticks_of_parts
 from protocol.orbits import SEARCH_SIDES, meeting_ticks, search_ticks
-from protocol.sweep_strips import Place, widest_distance
-from protocol.sweep_ticks import ticks_of_parts
 from world.faults import exchange_ticks
 from world.scenario import PlannedConfirmation, Scenario
 
@@ -66,7 +66,7 @@ def corrected_bounds(run: Run) -> tuple[CorrectedBound, ...]:
         late = tuple([robot for robot in run.robots if ends[robot] < tick and robot not in localised])
         waiting = [robot for robot in run.robots if robot not in localised]
         tour = _tour_ticks(scenario, waiting)
-        bound = begins + _return_ticks(scenario, waiting) + tour + _sweeps_ticks(scenario, tour)
+        bound = begins + _return_ticks(scenario, waiting) + tour + _coverage_ticks(scenario, tour)
         found.append(CorrectedBound(tick, late, bound))
         tick = (bound if min(claims.values(), default=last) <= begins else begins) + 1
     return tuple(found)
@@ -83,8 +83,8 @@ def _of_confirmation(run: Run, planned: PlannedConfirmation) -> tuple[CorrectedB
     return (CorrectedBound(late + 1, robots, math.ceil(last / period)),)
 
 
-def _sweeps_ticks(scenario: Scenario, tour: int) -> int:
-    """Return the ticks in which one robot sweeps all parts of the area; 0 if all robots have an anchor.
+def _coverage_ticks(scenario: Scenario, tour: int) -> int:
+    """Return the ticks in which one robot covers all parts of the area; 0 if all robots have an anchor.
 
     After each part, it makes a tour of at most `tour` ticks to robots that are late.
     """

@@ -12,11 +12,11 @@ import msgspec
 from msgspec.structs import replace
 
 from protocol.attack import Attack
+from protocol.coverage_strips import SweptArea
 from protocol.messages import Command, RobotConfig, TeamAnchor
 from protocol.mission import Anchor, Mission, PlannerName, Role
 from protocol.motion import Pose
 from protocol.orbits import RENDEZVOUS, Orbit
-from protocol.sweep_strips import SweptArea
 from protocol.units import RobotId, Tick
 from world.faults import Fault
 from world.scenario import RobotSpec, Scenario

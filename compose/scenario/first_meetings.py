@@ -10,8 +10,8 @@ from itertools import permutations
 from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
 from compose.scenario.group_confirmation import check_tolerated, with_confirmation
+from compose.scenario.group_coverage import check_unanchored, with_coverage
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, group_meetings
-from compose.scenario.group_sweep import check_unanchored, with_sweep
 from compose.scenario.scenario_tables import RobotTable, ScenarioFile
 from compose.scenario.team_plan import is_team
 from protocol.mission import infeasibility
@@ -74,7 +74,7 @@ def meetings_of(
     meetings = group_meetings(anchored, mission, file.planner, faults, tolerates=mission.tolerates)
     if mission.tolerates and len(anchored) == len(robots):
         return with_confirmation(robots, mission, meetings, faults, mission.tolerates)
-    return with_sweep(robots, mission.area, mission, meetings, tolerates=mission.tolerates)
+    return with_coverage(robots, mission.area, mission, meetings, tolerates=mission.tolerates)
 
 
 def _pair_meetings(file: ScenarioFile, links: Sequence[tuple[str, str]]) -> dict[str, FirstMeeting]:

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from itertools import combinations
 
 from compose.errors import Unworkable
+from compose.scenario.group_coverage import LEAVING_TICKS
 from compose.scenario.group_meetings import ALLOWED_SIDES, GroupMeetings
-from compose.scenario.group_sweep import LEAVING_TICKS
 from compose.scenario.scenario_tables import RobotTable, ScenarioFile
 from protocol.messages import Appointment
 from protocol.mission import Mission

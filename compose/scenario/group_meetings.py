@@ -17,7 +17,7 @@ from protocol.messages import Appointment
 from protocol.mission import Mission, Role
 from protocol.orbits import Rendezvous, meeting_ticks, pair_ticks, search_ticks, visiting
 from world.faults import Fault, exchange_ticks
-from world.scenario import PlannedConfirmation, PlannedMeeting, PlannedSweep
+from world.scenario import PlannedConfirmation, PlannedCoverage, PlannedMeeting
 
 NEIGHBOURS = 3
 """The number of nearest anchors among which a robot's first peer is chosen, in a large group."""
@@ -69,7 +69,7 @@ class GroupMeetings(NamedTuple):
     """The bound in s of the time at which the last of these has localised all robots that can be."""
     least_bound: float
     """A lower bound in s of the `bound` of any plan."""
-    planned_sweep: PlannedSweep | None = None
+    planned_sweep: PlannedCoverage | None = None
     """The search for robots without an anchor; None if all have one."""
     confirmation: PlannedConfirmation | None = None
     """The meetings that confirm poses; None if robots claim the pose that they know."""

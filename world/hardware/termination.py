@@ -17,8 +17,8 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 
+from protocol.coverage_ticks import robots_of_part, straight_ticks, ticks_of_parts
 from protocol.messages import Cause, Command, MissionEnd, RobotConfig, TickStart, Verdict
-from protocol.sweep_ticks import straight_ticks, sweepers_of_part, ticks_of_parts
 from world.referee import main_cause, mission_end, shortfall
 
 LAST_WORDS = 4
@@ -46,7 +46,7 @@ class Ending:
         self._in_pair = not config.members and config.team is None
         self._peers = {config.robot: config.peer, config.peer: config.robot} if self._in_pair else {}
         """The peer of each robot of a pair."""
-        planned = max(self._ends.values(), default=0) + _sweep_ticks(config)
+        planned = max(self._ends.values(), default=0) + _coverage_ticks(config)
         self._plan = max(planned, _confirmed_tick(config))
         """The tick until which all are; a bound of it if some have no anchor. A pair has no plan."""
         self._visits = config.given_anchor is not None
@@ -147,14 +147,14 @@ def _confirmed_tick(config: RobotConfig) -> int:
     return math.ceil(max(ends, default=0.0) / config.mission.period)
 
 
-def _sweep_ticks(config: RobotConfig) -> int:
-    """Return a bound on the ticks in which each robot with an anchor sweeps its parts; 0 if all have one.
+def _coverage_ticks(config: RobotConfig) -> int:
+    """Return a bound on the ticks in which each robot with an anchor covers its parts; 0 if all have one.
 
-    If robots may report false data, it sweeps more than one, and goes to the other robots before each.
+    If robots may report false data, it covers more than one, and goes to the other robots before each.
     """
     if config.sweep is None:
         return 0
     mission, widest = config.mission, config.widest_distance
     once = PARTING_TICKS + max(ticks_of_parts(config.sweep, mission, widest, len(config.unanchored)))
     tour = len(config.members) * straight_ticks(widest, mission)
-    return once + (sweepers_of_part(config.tolerates) - 1) * (once + tour)
+    return once + (robots_of_part(config.tolerates) - 1) * (once + tour)

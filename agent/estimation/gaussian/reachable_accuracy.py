@@ -21,11 +21,11 @@ from agent.estimation.gauss_newton import Convergence
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import Array, expected_variances, position_variances, track
+from protocol.coverage_strips import Place
+from protocol.coverage_ticks import straight_ticks
 from protocol.mission import Mission
 from protocol.motion import rotated
 from protocol.noise import Noise, VelocityNoise
-from protocol.sweep_strips import Place
-from protocol.sweep_ticks import straight_ticks
 
 PRIORS = {
     "range_bias": "measure the bias of the radios at known distances",
@@ -157,7 +157,7 @@ def position_sigmas(pair: JointMeasurements, poses: Array) -> list[float]:
     return [math.inf, math.inf]
 
 
-def swept_sigma(mission: Mission, way: Sequence[Place]) -> float:
+def covering_sigma(mission: Mission, way: Sequence[Place]) -> float:
     """Return the median sigma (m) of the position of a robot that drives along `way` (m) from a known pose.
 
     The sigma is that of the white noise of its odometry; the median is over all ticks of the way.

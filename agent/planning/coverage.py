@@ -1,4 +1,4 @@
-"""The sweep of an area by a robot that looks for others without an anchor, and its loops beside them.
+"""The coverage of an area by a robot that looks for others without an anchor, and its loops beside them.
 
 With exact sensors, it knows its pose by dead reckoning, stops for all robots that are near, and leaves half
 of its strips to those that it has found.
@@ -15,10 +15,10 @@ from msgspec.structs import replace
 from agent.planning import exchange
 from agent.planning.drive import way_to
 from agent.planning.state import RobotState
-from agent.planning.tasks import Looping, Sweeping, transformed
+from agent.planning.tasks import Covering, Looping, transformed
+from protocol.coverage_strips import SIDE, STRIP_REACH, Place
 from protocol.messages import Report, ReportedPose
 from protocol.motion import inverse
-from protocol.sweep_strips import SIDE, STRIP_REACH, Place
 
 LINGER = 10
 """The ticks without a range to robots without an anchor after which a contact with them is over."""
@@ -52,7 +52,7 @@ def looping_both_ways(
     return Looping(transformed(state.odometry, corners), then, since)
 
 
-def onward(state: RobotState, task: Sweeping | Looping) -> Sweeping | Looping:
+def onward(state: RobotState, task: Covering | Looping) -> Covering | Looping:
     """Return `task` without the places at which the robot has arrived."""
     while task.places and way_to(state, task.places[0]) is None:
         task = replace(task, places=task.places[1:])
@@ -60,9 +60,9 @@ def onward(state: RobotState, task: Sweeping | Looping) -> Sweeping | Looping:
 
 
 def strips(state: RobotState) -> tuple[int, int] | None:
-    """Return the strips that the robot has not begun to sweep, as Report.strips has them."""
+    """Return the strips that the robot has not begun to cover, as Report.strips has them."""
     match state.task:
-        case Sweeping(places):
+        case Covering(places):
             left = len(places)
         case Looping(_, then):
             left = len(then) - 1  # the first one is where it has left its strip
@@ -73,21 +73,21 @@ def strips(state: RobotState) -> tuple[int, int] | None:
 
 
 def without_strips(state: RobotState, others: tuple[int, int] | None) -> RobotState:
-    """Return `state` without the last strips of its sweep, if these are those that another robot sweeps."""
+    """Return `state` without its last strips, if these are those that another robot covers."""
     own = strips(state)
     if own is None or others is None or not own[0] < others[0] < others[1] == own[1]:
         return state
     most, task = -2 * (others[1] - others[0]), state.task
     match task:
-        case Sweeping(places):
-            task = Sweeping(places[:most])
+        case Covering(places):
+            task = Covering(places[:most])
         case Looping(_, then):
             task = replace(task, then=then[:most])
     return state.doing(task).with_agenda(strips_end=others[0])
 
 
 def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
-    """Return `state` of a robot that sweeps the second half of the strips of another one, which it is beside.
+    """Return `state` of a robot that covers the second half of the strips of another one, which it is beside.
 
     It stands still until that one has heard it. Its way to them is at most R longer than that one's. Strips
     that the area does not have change nothing.
@@ -103,18 +103,18 @@ def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
         return replace(state, config=replace(state.config, part=part + 1))
     state = state.with_agenda(parts=state.agenda.parts + 1)
     state = along(replace(state, config=replace(state.config, part=part)), (first, end))
-    assert isinstance(state.task, Sweeping)
+    assert isinstance(state.task, Covering)
     here = (state.odometry.x, state.odometry.y)
     return state.doing(Looping((), (here, *state.task.places), state.tick))
 
 
 def along(state: RobotState, chosen: tuple[int, int]) -> RobotState:
-    """Return `state` at the begin of a sweep of the strips `chosen`."""
+    """Return `state` at the begin of the coverage of the strips `chosen`."""
     config, agenda = state.config, state.agenda
     assert config.sweep is not None
     path = config.sweep.path(chosen, config.mission.sensing_range)
     state = state.with_agenda(strips_end=None if state.config.tolerates else chosen[1])
-    return state.doing(Sweeping(transformed(inverse(agenda.frame), path)))
+    return state.doing(Covering(transformed(inverse(agenda.frame), path)))
 
 
 def with_pose(state: RobotState, peer: str, report: Report) -> Report:
@@ -125,14 +125,14 @@ def with_pose(state: RobotState, peer: str, report: Report) -> Report:
 
 
 def begun(state: RobotState, part: int) -> RobotState:
-    """Return `state` at the begin of the sweep of a part of the area."""
+    """Return `state` at the begin of the coverage of a part of the area."""
     area = state.config.sweep
     assert area is not None
     return along(state, area.strips_of(part, state.config.mission.sensing_range))
 
 
 def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
-    """Return `state` after a tick of a sweep, and stops for those of `helped` that are near."""
+    """Return `state` after a tick of the coverage, and stops for those of `helped` that are near."""
     near = [one for one in helped if _is_near(state, one)]
     return moved_on(state, near, partial(looping, state), stops=bool(near), longest=LOOPS_FOR)
 
@@ -159,28 +159,28 @@ def moved_on(
     stops: bool,
     longest: int,
 ) -> RobotState:
-    """Return `state` after a tick of a sweep, in which the robots `helped` without an anchor are in contact.
+    """Return `state` after a tick of the coverage; the robots `helped` without an anchor are in contact.
 
     If it `stops` for them, it leaves its strip and drives a `loop`, of which it gives the first tick and the
-    places that are left of the sweep. It repeats the loop until nobody is in contact any more, or for
+    places that are left of the coverage. It repeats the loop until nobody is in contact any more, or for
     `longest` ticks, and then returns to where it has left its strip.
     """
-    assert isinstance(state.task, Sweeping | Looping)
+    assert isinstance(state.task, Covering | Looping)
     task = onward(state, state.task)
     if isinstance(task, Looping) and state.tick - task.since > longest:
         for robot in helped:
             state = state.with_other(robot, failed=True)
         helped = []
     match task:
-        case Sweeping(places) if stops:
+        case Covering(places) if stops:
             task = loop(state.tick, ((state.odometry.x, state.odometry.y), *places))
         case Looping((), then, since) if helped:
             task = loop(since, then)
         case Looping(_, then) if not helped:
-            task = onward(state, Sweeping(then))
+            task = onward(state, Covering(then))
     return state.doing(task)
 
 
 def is_over(state: RobotState) -> bool:
     """Return whether the robot has driven along all strips of its part."""
-    return isinstance(state.task, Sweeping) and not state.task.places
+    return isinstance(state.task, Covering) and not state.task.places

@@ -1,4 +1,4 @@
-"""Bounds on the ticks that a sweep takes: of its ways, of its stops, and of whole parts of the area."""
+"""Bounds on the ticks that the coverage takes: of its ways, of its stops, and of whole parts of the area."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ import math
 from collections.abc import Sequence
 from itertools import pairwise
 
+from protocol.coverage_strips import ALONG, ASIDE, SIDE, STEP, Place, SweptArea, surveyed_path
 from protocol.mission import Mission
-from protocol.sweep_strips import ALONG, ASIDE, SIDE, STEP, Place, SweptArea, surveyed_path
 
 LOOPS = 3
 """The number of squares within which a robot that has been found is localised.
@@ -20,21 +20,21 @@ NOISY_LOOPS = 2
 """The pairs of rectangles within which a robot that has been found is localised under noise.
 
 A robot with sigmas of 0.05 m and R = 3 m takes 12 to 30 of their 65 ticks. With less, some are left for a
-later part of the sweep; with more, a robot that cannot be localised holds the other one up for longer.
+later part of the coverage; with more, a robot that cannot be localised holds the other one up for longer.
 """
 
 ENOUGH_SIGMA, MOST_TIMES = 1.0 / 6.0, 10.0
 """The sigma of a range from which contacts take longer, in units of the accuracy, and the largest factor."""
 
 
-def sweep_speed(mission: Mission) -> float:
-    """Return the speed in m/s of a sweep, with which no robot is passed between two ticks."""
+def coverage_speed(mission: Mission) -> float:
+    """Return the speed in m/s of the coverage, with which no robot is passed between two ticks."""
     return min(mission.max_speed, STEP * mission.sensing_range / mission.period)
 
 
 def straight_ticks(length: float, mission: Mission) -> int:
-    """Return the ticks in which a robot drives straight on for `length` m, with the speed of a sweep."""
-    return math.ceil(length / (sweep_speed(mission) * mission.period))
+    """Return the ticks in which a robot drives straight on for `length` m, with the speed of the coverage."""
+    return math.ceil(length / (coverage_speed(mission) * mission.period))
 
 
 def turn_ticks(mission: Mission) -> int:
@@ -49,9 +49,9 @@ def way_ticks(places: Sequence[Place], mission: Mission) -> int:
 
 
 def helping_ticks(mission: Mission) -> int:
-    """Return a bound on the ticks for which a sweeping robot stops to localise another one.
+    """Return a bound on the ticks for which a covering robot stops to localise another one.
 
-    It includes the way of that one, at most R long, to the way of the first, half of whose strips it sweeps.
+    It includes the way of that one, at most R long, to the way of the first, half of whose strips it covers.
     """
     side, reach = SIDE * mission.sensing_range, mission.sensing_range
     square = way_ticks([(0.0, 0.0), (side, 0.0), (side, side), (0.0, side), (0.0, 0.0)], mission)
@@ -59,7 +59,7 @@ def helping_ticks(mission: Mission) -> int:
 
 
 def contact_ticks(mission: Mission) -> int:
-    """Return the most ticks for which a sweeping robot stops for another one with noisy sensors.
+    """Return the most ticks for which a covering robot stops for another one with noisy sensors.
 
     The number of ranges that it takes grows with the square of their sigma over the accuracy.
     """
@@ -79,7 +79,7 @@ def part_ticks(path: Sequence[Place], mission: Mission, unanchored: int) -> int:
 
 
 def ticks_of_parts(area: SweptArea, mission: Mission, widest: float, unanchored: int) -> list[int]:
-    """Return a bound on the ticks in which any robot drives to each part of `area`, and sweeps it.
+    """Return a bound on the ticks in which any robot drives to each part of `area`, and covers it.
 
     It stops once for each of the `unanchored` robots. No two anchors or corners of the area are more than
     `widest` m apart. With noisy sensors, a robot also passes its anchor and its beacon, as far away as that.
@@ -95,8 +95,8 @@ def ticks_of_parts(area: SweptArea, mission: Mission, widest: float, unanchored:
     return [straight_ticks(widest, mission) + part_ticks(path, mission, unanchored) for path in paths]
 
 
-def sweepers_of_part(tolerates: int) -> int:
-    """Return the number of robots that sweep each part, so that `tolerates` + 1 of them are honest.
+def robots_of_part(tolerates: int) -> int:
+    """Return the number of robots that cover each part, so that `tolerates` + 1 of them are honest.
 
     As many robots may report false data as `tolerates` says.
     """

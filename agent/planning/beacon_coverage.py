@@ -1,7 +1,7 @@
-"""The sweep of a robot with noisy sensors, which keeps its pose by its own anchor and by a beacon.
+"""The coverage of an area with noisy sensors: the robot keeps its pose by its own anchor and by a beacon.
 
-The visitor of a last meeting sweeps a part of the area. The robot that it has visited stays where it is, and
-is its beacon: before each two strips, the sweeping robot passes its own anchor and its beacon, so that it
+The visitor of a last meeting covers a part of the area. The robot that it has visited stays where it is, and
+is its beacon: before each two strips, the covering robot passes its own anchor and its beacon, so that it
 knows its pose again. Ranges to both are measurements of their meeting like those before its claim. Where it
 comes into range of a robot without an anchor, it reports its pose with the covariance, which stay fixed
 during the contact, and its odometry from then on.
@@ -20,14 +20,14 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import pair_of
 from agent.estimation.judged import Judged
 from agent.estimation.posterior import PAIR, Hypothesis, Posterior, follow
-from agent.planning import sweep
+from agent.planning import coverage
+from agent.planning.coverage import LINGER, ticks_since
 from agent.planning.state import RobotState
-from agent.planning.sweep import LINGER, ticks_since
-from agent.planning.tasks import Done, Looping, Sweeping, transformed
+from agent.planning.tasks import Covering, Done, Looping, transformed
+from protocol.coverage_strips import ALONG, ASIDE, STRIP_REACH, Place, surveyed_path
+from protocol.coverage_ticks import contact_ticks
 from protocol.messages import Localised, Ranged, Report, ReportedPose
 from protocol.motion import Covariance, compose, inverse
-from protocol.sweep_strips import ALONG, ASIDE, STRIP_REACH, Place, surveyed_path
-from protocol.sweep_ticks import contact_ticks
 
 WORTH = 0.9
 """The largest sigma of its position with which a robot stops for another one, in units of the accuracy.
@@ -75,12 +75,12 @@ def with_pose(state: RobotState, peer: str, report: Report) -> Report:
 
 
 def beacon(state: RobotState) -> str | None:
-    """Return the peer of a robot that sweeps, or this robot if it is a beacon; None if there is none.
+    """Return the peer of a robot that covers an area, or this robot if it is a beacon; None if there is none.
 
-    A beacon stays where it is: it sweeps no part, and its planned meetings are over.
+    A beacon stays where it is: it covers no part, and its planned meetings are over.
     """
     config, agenda = state.config, state.agenda
-    if state.sweeps:
+    if state.covers:
         return config.peer
     if config.sweep is None or config.part < config.sweep.parts or agenda.visits < len(config.visits):
         return None
@@ -89,7 +89,7 @@ def beacon(state: RobotState) -> str | None:
 
 
 def begun(state: RobotState, part: int) -> RobotState:
-    """Return `state` at the begin of the sweep of a part. A beacon sweeps none, and stays where it is."""
+    """Return `state` at the begin of the coverage of a part. A beacon covers none, and stays where it is."""
     config, fix = state.config, state.agenda.fix
     assert config.sweep is not None
     if config.part >= config.sweep.parts:
@@ -111,11 +111,11 @@ def begun(state: RobotState, part: int) -> RobotState:
     state = updated(state.with_agenda(own_pose=due))
     anchor, beacon = state.config.anchor, beacon_place(state)
     path = surveyed_path(config.sweep, part, config.mission.sensing_range, (anchor.x, anchor.y), beacon)
-    return state.doing(Sweeping(transformed(inverse(state.agenda.frame), path)))
+    return state.doing(Covering(transformed(inverse(state.agenda.frame), path)))
 
 
 def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
-    """Return `state` after a tick of a sweep, in which it stops where its own pose is known well enough.
+    """Return `state` after a tick of the coverage: it stops where its own pose is known well enough.
 
     Its verdict is Undecided if that contradicts its claim. The robots `helped` have no anchor.
     """
@@ -125,10 +125,10 @@ def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
     helped = [one for one in helped if ticks_since(state, one) <= LINGER]
     stops = any(_stops_for(state, one) for one in helped)
     loop = partial(
-        sweep.looping_both_ways, state, ALONG * mission.sensing_range, ASIDE * mission.sensing_range
+        coverage.looping_both_ways, state, ALONG * mission.sensing_range, ASIDE * mission.sensing_range
     )
-    state = sweep.moved_on(state, helped, loop, stops=stops, longest=contact_ticks(mission))
-    return _with_reference(state, None) if sweep.is_over(state) else state
+    state = coverage.moved_on(state, helped, loop, stops=stops, longest=contact_ticks(mission))
+    return _with_reference(state, None) if coverage.is_over(state) else state
 
 
 def _with_contact(state: RobotState, helped: Sequence[str]) -> RobotState:
@@ -233,8 +233,8 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
     assert now.covariance is not None
     framed = state.with_frame(now.pose)
     turn, task = compose(inverse(framed.agenda.frame), state.agenda.frame), state.task
-    if isinstance(task, Sweeping):
-        task = Sweeping(transformed(turn, task.places))
+    if isinstance(task, Covering):
+        task = Covering(transformed(turn, task.places))
     elif isinstance(task, Looping):
         task = replace(task, then=transformed(turn, task.then))
     posterior = replace(state.posterior, pair=tuple(scored))

@@ -1,4 +1,4 @@
-"""The search of a group for its robots without an anchor: who sweeps which part, and until when."""
+"""The search of a group for its robots without an anchor: who covers which part, and until when."""
 
 from __future__ import annotations
 
@@ -11,12 +11,12 @@ from compose.errors import BadScenario, Unworkable
 from compose.launch import planner_loader
 from compose.scenario.group_meetings import FirstMeeting, GroupMeetings, check_gyros, rounded_down
 from compose.scenario.scenario_tables import Area, RobotTable, ScenarioFile
+from protocol.coverage_strips import Place, SweptArea, surveyed_path, ways_between_passages, widest_distance
+from protocol.coverage_ticks import part_ticks, robots_of_part, straight_ticks, ticks_of_parts, turn_ticks
 from protocol.mission import Mission, infeasibility
 from protocol.noise import VelocityNoise
 from protocol.orbits import Orbit, Rendezvous
-from protocol.sweep_strips import Place, SweptArea, surveyed_path, ways_between_passages, widest_distance
-from protocol.sweep_ticks import part_ticks, straight_ticks, sweepers_of_part, ticks_of_parts, turn_ticks
-from world.scenario import PlannedMeeting, PlannedSweep
+from world.scenario import PlannedCoverage, PlannedMeeting
 
 LEAVING_TICKS = 10
 """The bound on the ticks after a meeting until a robot goes on (see `meetings.PARTED_AFTER`)."""
@@ -24,8 +24,8 @@ LEAVING_TICKS = 10
 LEAVES_WITHIN = 2.0
 """The largest distance from the anchor of its last meeting at which a robot goes on, in units of R."""
 
-SWEEPS_SLOWER = 3.0
-"""The time for sweeps in `max_ticks`, in units of the planned bound: others sweep the parts of the dead."""
+COVERED_SLOWER = 3.0
+"""The time for coverage in `max_ticks`, in units of the planned bound: others cover the parts of the dead."""
 
 MOST_WANDERED = 1.25
 """The largest sigma of a robot on its strips by the white noise of its odometry, in units of the accuracy.
@@ -65,7 +65,7 @@ def _check_attacks(file: ScenarioFile, anchored: int) -> None:
     attacks = [i for i, robot in enumerate(file.robot) if robot.attack is not None]
     if tolerates and not file.mission.noise.exact:
         raise Unworkable("mission.tolerates: with noisy sensors, all robots need an anchor")
-    needed = sweepers_of_part(tolerates)
+    needed = robots_of_part(tolerates)
     if tolerates and anchored < needed:
         raise Unworkable(
             f"mission.tolerates: to tolerate {tolerates}, {needed} robots need an anchor, of which "
@@ -96,7 +96,7 @@ def _check_area(file: ScenarioFile, missing: Sequence[int]) -> None:
             raise BadScenario(f"robot[{i}].start: '{file.robot[i].id}' is outside mission.area")
 
 
-def with_sweep(
+def with_coverage(
     robots: Sequence[RobotTable],
     area: Area | None,
     mission: Mission,
@@ -106,9 +106,9 @@ def with_sweep(
 ) -> GroupMeetings:
     """Return `meetings` with the search for those of `robots` that have no anchor, which are in `area`.
 
-    `tolerates` of the robots may report false data, so each part is swept by several of them. The latest time
-    allows for robots that sweep the parts of others, which have failed. Raises Unworkable if the area is too
-    large for rounding errors, or if gyros or odometry are too inaccurate for a sweep.
+    `tolerates` of the robots may report false data, so several of them cover each part. The latest time
+    allows for robots that cover the parts of others, which have failed. Raises Unworkable if the area is too
+    large for rounding errors, or if gyros or odometry are too inaccurate for it.
     """
     unanchored = [robot.id for robot in robots if robot.anchor is None]
     if not unanchored or area is None:
@@ -118,26 +118,26 @@ def with_sweep(
     why = infeasibility(mission, widest)
     if why is not None:
         raise Unworkable(f"mission.area: {why}")
-    planned = _planned_sweep(anchors, len(unanchored), area, mission, meetings)
-    each = _next_sweep_ticks(planned.sweep, mission, widest, len(unanchored))
-    ends = planned.ends + (sweepers_of_part(tolerates) - 1) * each * mission.period
+    planned = _planned_coverage(anchors, len(unanchored), area, mission, meetings)
+    each = _next_coverage_ticks(planned.sweep, mission, widest, len(unanchored))
+    ends = planned.ends + (robots_of_part(tolerates) - 1) * each * mission.period
     planned = msgspec.structs.replace(planned, ends=ends)
     still = Orbit(0.0, 0.0, 0.0)
     waiting = FirstMeeting(planned.sweepers[0], "b", Rendezvous(still, still, planned.ends))
     return meetings._replace(
         first={**meetings.first, **dict.fromkeys(unanchored, waiting)},
         bound=planned.ends,
-        latest=meetings.latest + SWEEPS_SLOWER * planned.ends,
+        latest=meetings.latest + COVERED_SLOWER * planned.ends,
         planned_sweep=planned,
     )
 
 
-def _planned_sweep(
+def _planned_coverage(
     anchors: Mapping[str, Place], unanchored: int, area: Area, mission: Mission, meetings: GroupMeetings
-) -> PlannedSweep:
+) -> PlannedCoverage:
     """Return the search for `unanchored` robots in `area`, in m, after `meetings`.
 
-    Each robot with an anchor sweeps a part after its last meeting. With noisy sensors, only the visitors of
+    Each robot with an anchor covers a part after its last meeting. With noisy sensors, only the visitors of
     last meetings do; the robots that they have visited stay, as their beacons, and come last among the
     sweepers. Parts and robots are in the same order across the strips, so that their ways do not cross.
     Raises Unworkable if gyros or odometry are not good enough for a round.
@@ -164,7 +164,7 @@ def _planned_sweep(
             )
             _check_odometry(mission, rounds)
         latest = max(latest, free[robot] + ticks * mission.period)
-    return PlannedSweep(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)
+    return PlannedCoverage(sweep, (*finders, *[one for one in anchors if one not in finders]), latest)
 
 
 def _last_meetings(
@@ -186,8 +186,8 @@ def _last_visitors(meetings: GroupMeetings) -> list[str]:
     return [robot for robot, one in last.items() if one.visitor == robot and last[one.visited] is one]
 
 
-def _next_sweep_ticks(sweep: SweptArea, mission: Mission, widest: float, unanchored: int) -> int:
-    """Return the bound on the ticks in which each part is swept by one robot more than before.
+def _next_coverage_ticks(sweep: SweptArea, mission: Mission, widest: float, unanchored: int) -> int:
+    """Return the bound on the ticks in which each part is covered by one robot more than before.
 
     That robot goes to all anchors first. No two of these or corners of the area are more than `widest` m
     apart.
@@ -203,14 +203,14 @@ def _check_odometry(mission: Mission, ways: Sequence[Sequence[Place]]) -> None:
     if noise == VelocityNoise():
         return
     # imports numpy, which scenarios without this noise do not need
-    from agent.estimation.gaussian.reachable_accuracy import rounded_up, swept_sigma  # noqa: PLC0415
+    from agent.estimation.gaussian.reachable_accuracy import covering_sigma, rounded_up  # noqa: PLC0415
 
-    sigma = max([swept_sigma(mission, way) for way in ways])
+    sigma = max([covering_sigma(mission, way) for way in ways])
     if sigma > MOST_WANDERED * mission.accuracy:
         share = rounded_down(MOST_WANDERED * mission.accuracy / sigma)
         raise Unworkable(
-            f"mission.noise.odometry: between two passages of its anchor, a robot that sweeps knows its "
-            f"position to {sigma:.2g} m on half of its way, more than {MOST_WANDERED:g} of the accuracy of "
-            f"{mission.accuracy:g} m: reduce this noise to {share:g} of it, or set an accuracy of "
+            f"mission.noise.odometry: between two passages of its anchor, a robot that covers the area knows "
+            f"its position to {sigma:.2g} m on half of its way, more than {MOST_WANDERED:g} of the accuracy "
+            f"of {mission.accuracy:g} m: reduce this noise to {share:g} of it, or set an accuracy of "
             f"{rounded_up(sigma / MOST_WANDERED):g} m"
         )

@@ -1,4 +1,4 @@
-"""Strips in which localised robots sweep an area, so that no robot that stands in it is missed."""
+"""Strips in which localised robots cover an area, so that no robot that stands in it is missed."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ HALF_WIDTH = 0.8
 """The largest distance of a robot from the middle of its strip, as a fraction of R."""
 
 STRIP_REACH = 0.9
-"""The largest range at which a sweeping robot stops for another one, as a fraction of R."""
+"""The largest range at which a covering robot stops for another one, as a fraction of R."""
 
 STEP = 0.5
-"""The largest distance driven in a tick of a sweep, as a fraction of R.
+"""The largest distance driven in a tick of the coverage, as a fraction of R.
 
 A robot at HALF_WIDTH, on a square of its own, is at most 0.84 R from the middle line, and 0.63 R of the line
 are within STRIP_REACH R of it. That is more than STEP, so a tick ends there. At the end of a strip it is half
@@ -67,7 +67,7 @@ PLACES_OF_ROUND = PLACES_PASSED + 2 * STRIPS_OF_ROUND
 
 
 class SweptArea(msgspec.Struct, frozen=True, array_like=True, forbid_unknown_fields=True):
-    """The parts of an area that robots sweep, one each."""
+    """The parts of an area that robots cover, one each."""
 
     x_min: Coordinate
     """The smallest x of the area, in m."""
