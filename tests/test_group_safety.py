@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from agent.planning.agenda import Bypass
 from agent.planning.passing import (
     BLOCKED_AFTER,
-    PATIENCE,
+    MOST_YIELDED,
     RESERVE,
     aside,
     leeway,
@@ -96,7 +96,7 @@ def test_a_robot_is_blocked_while_little_way_is_left_that_does_not_grow() -> Non
 
 def test_one_that_waits_for_another_one_drives_aside_after_it() -> None:
     passing = Bypass(leeway=LITTLE, blocked=BLOCKED_AFTER - 1)
-    for _ in range(PATIENCE):
+    for _ in range(MOST_YIELDED):
         passing = ticked(passing, LITTLE, waits=True)
         assert (passing.leeway, passing.places) == (0.0, ())
     assert ticked(passing, LITTLE, waits=True).places

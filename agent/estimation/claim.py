@@ -33,7 +33,7 @@ bound delays one of a hundred right claims by a few ticks.
 """
 
 LARGEST_STRAY_SHARE = 0.15
-"""The largest fraction of ranges that may be strays, in addition to the outliers that were told."""
+"""The largest fraction of ranges that may be strays, in addition to the stated outliers."""
 
 EARLY_SIGMAS = 3.0
 """The number of standard deviations by which ranges must be early for the odometry to be taken for late."""
@@ -51,8 +51,8 @@ of MRCLAM 6 are wrong; with more, a claim takes longer after a disagreement by c
 MOST_WIDENED = 2.5
 """The largest factor by which a finder multiplies its covariance, to cover the likelihood of its rivals.
 
-In a group whose fit was right, it was 1.6. With less, fewer robots are found in the first sweep; with more,
-the ellipse has little to do with the likelihood.
+In a group whose fit was right, it was 1.6. With less, fewer robots are found when the area is covered for
+the first time; with more, the ellipse has little to do with the likelihood.
 """
 
 SMALLEST_EIGENVALUE = 1e-12
@@ -270,9 +270,9 @@ def parts(judged: Judged) -> str:
 @condition("recording", last=True)
 def parts_before(judged: Judged) -> str:
     """The time has grown by a factor of {MORE_TIME:g} since parts of the ranges disagreed last."""
-    if judged.passed >= MORE_TIME * judged.disagreed:
+    if judged.ticks >= MORE_TIME * judged.disagreed:
         return ""
-    since = judged.measured.period * (judged.passed - judged.disagreed)
+    since = judged.measured.period * (judged.ticks - judged.disagreed)
     return f"parts of the ranges disagreed {since:.3g} s ago"
 
 

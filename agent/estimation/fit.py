@@ -61,7 +61,7 @@ class Fit(NamedTuple):
     weights: Array
     """The probability that each range is an inlier; shape (N,)."""
     chi2: float
-    """The least sum of squares of all errors in their sigmas, as told."""
+    """The least sum of squares of all errors, each in the sigma that the noise model states."""
     last_step: float
     """The expected length of the next Gauss-Newton step, in sigmas."""
     level: float
@@ -293,7 +293,7 @@ LARGER = 1e-3
 
 
 @lru_cache(maxsize=8)
-def with_told_priors(fit: Fit) -> Fit:
+def with_unscaled_priors(fit: Fit) -> Fit:
     """Return `fit` with a covariance of which a noise level below 1 multiplies only the part of white errors.
 
     Small residuals show that white errors are small, not that biases and slow errors are smaller than their
@@ -323,8 +323,8 @@ class HeldFit(NamedTuple):
 def held_fits(measured: JointMeasurements, begun: Fit, held: Sequence[tuple[float, int]]) -> list[HeldFit]:
     """Return the fits from the fit `begun` with one more range, the last one, which holds a coordinate.
 
-    `held` has that range (m) and the number of steps of each fit. A fit is as likely as can be if a number is
-    too large for a float.
+    `held` has that range (m) and the number of steps of each fit. A fit in which a number is too large for a
+    float has an infinite likelihood, so that it blocks the claim.
     """
     problem, found = Problem.of(measured), []
     poses, constant, white, _ = _begin(problem, begun.start)

@@ -113,9 +113,9 @@ class Following(NamedTuple):
     doubted: int = 0
     """The number of ranges at the first of the latest tests that all found one; 0 if the last one did not."""
     disagreed: Mapping[str, int] = {}
-    """The number of ticks after which parts of the ranges have disagreed last, of each robot."""
+    """The number of ticks at the latest disagreement of parts of the ranges of each robot."""
     compared: Mapping[str, int] = {}
-    """The number of ticks at the latest comparison of parts, of each robot."""
+    """The number of ticks at the latest comparison of these parts."""
     begun_again: int = 0
     """The number of ranges at which a team has dropped hypotheses that its measurements contradict."""
 
@@ -208,10 +208,10 @@ class Following(NamedTuple):
             judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
         reasons = {name: blocked(one, rule.conditions) for name, one in judged.items()}
         disagreed = {
-            name: judged[name].passed for name, one in reasons.items() if one and one.condition is parts
+            name: judged[name].ticks for name, one in reasons.items() if one and one.condition is parts
         }
         compared = {
-            name: judged[name].passed
+            name: judged[name].ticks
             for name, one in reasons.items()
             if (one is None or one.condition in (parts, parts_before)) and judged[name].compares
         }

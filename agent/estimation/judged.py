@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Literal, NamedTuple, get_args
 
-from agent.estimation.fit import Fit, with_told_priors
+from agent.estimation.fit import Fit, with_unscaled_priors
 from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
 from agent.estimation.gaussian.consistency import (
     HIGHEST_LEVEL,
@@ -123,19 +123,19 @@ class Judged(NamedTuple):
     displaced: Displacement | None = None
     """The anchor that seems to stand elsewhere than it was surveyed, if one does."""
     disagreed: int = 0
-    """The number of ticks after which parts of the ranges have disagreed last."""
+    """The number of ticks at the latest disagreement of parts of the ranges; 0 if there was none."""
     compared: int = 0
-    """The number of ticks at the latest comparison of parts of the ranges."""
+    """The number of ticks at the latest comparison of parts of the ranges; 0 before the first."""
 
     @property
-    def passed(self) -> int:
+    def ticks(self) -> int:
         """The number of ticks so far."""
         return max([len(path.v) for path in self.measured.paths])
 
     @property
     def compares(self) -> bool:
         """True if parts of the ranges are to be compared now."""
-        return self.passed >= RECOMPARED * self.compared
+        return self.ticks >= RECOMPARED * self.compared
 
     @property
     def rival(self) -> Rival:
@@ -211,7 +211,7 @@ def of_joint(
     """
     fit = found.hypotheses[0].fit
     if user == "recording":
-        fit = with_told_priors(fit)
+        fit = with_unscaled_priors(fit)
     exact = measured.only_rounding and bool(measured.started)
     return Judged(
         user=user,

@@ -76,12 +76,12 @@ typedef struct {
     double *place, *moves, *direction, *residual, *rate;
 } Walk;
 
-/* smoother.Passed and smoother.Told; `row_of` has the places and derivatives of a range. Those from
+/* smoother.Passed and smoother.Adjoint; `row_of` has the places and derivatives of a range. Those from
    `updated` on are vectors of a fit: with an element for each range, the limited step with one for each unknown,
    and then the weights and the noise of the ticks. */
 typedef struct {
     double *innovation, *variance, *effects, *gain, *state, *u, *p, *information, *gradient;
-    double *misfit, *of_limited, *told, *told_limited, *by_unknowns, *weight, *weighted, *effect;
+    double *misfit, *of_limited, *adjoint, *adjoint_limited, *by_unknowns, *weight, *weighted, *effect;
     double *lower, *whitening, *inner, *vector, *other;
     double *updated, *errors, *spread, *ratios, *shorter, *sound, *noise;
 } Work;
@@ -535,12 +535,12 @@ SIZED double chi2_of(const Measured *of, const double *poses, const double *chan
     return chi2;
 }
 
-SIZED void told_by(const Measured *of, const Walk *walk, Index j, Work *w, Step *to)
+SIZED void weighed_in(const Measured *of, const Walk *walk, Index j, Work *w, Step *to)
 {
     const Index s = states(of), q = unknowns(of), size = estimated(of);
     const double *gain = w->gain + j * s, spread = w->variance[j];
-    to->multipliers[j] = w->misfit[j] / spread - dot(gain, w->told, s);
-    to->own[j] = w->of_limited[j] / spread - dot(gain, w->told_limited, s);
+    to->multipliers[j] = w->misfit[j] / spread - dot(gain, w->adjoint, s);
+    to->own[j] = w->of_limited[j] / spread - dot(gain, w->adjoint_limited, s);
     double *effect = w->effect, *weighted = w->weighted;
     for (Index e = 0; e < size; e++) effect[e] = w->effects[j * q + e] / spread;
     for (Index a = 0; a < s; a++) add(effect, -gain[a], w->by_unknowns + a * size, size);
@@ -556,8 +556,8 @@ SIZED void told_by(const Measured *of, const Walk *walk, Index j, Work *w, Step 
     for (int t = 0; t < row.count; t++) {
         const Index a = row.at[t];
         const double h = row.by[t];
-        w->told[a] += h * to->multipliers[j];
-        w->told_limited[a] += h * to->own[j];
+        w->adjoint[a] += h * to->multipliers[j];
+        w->adjoint_limited[a] += h * to->own[j];
         add(w->by_unknowns + a * size, h, effect, size);
         if (!moves) continue;
         add(w->weight + a * s, -h, weighted, s);
@@ -578,7 +578,7 @@ SIZED void shock_of(const Measured *of, const Walk *walk, Index i, Index k, Work
         shock[e] = 0.0;
         memset(w->effect, 0, sizeof(double) * size);
         for (Index a = 0; a < 2 + e; a++) {
-            shock[e] += effects[e][a] * w->told[x + a];
+            shock[e] += effects[e][a] * w->adjoint[x + a];
             add(w->effect, effects[e][a], w->by_unknowns + (x + a) * size, size);
         }
         whitened(w->whitening, size, w->effect, by[e]);
@@ -598,11 +598,11 @@ SIZED void attributed(const Measured *of, const Walk *walk, Index i, Index k, Wo
     const Index s = states(of), size = estimated(of), K = of->ticks, x = 3 * i, y = 3 * i + 1, h = 3 * i + 2;
     const double *move = walk->moves + 8 * (i * K + k);
     const double sx = move[0], sy = move[1], dx = move[2], dy = move[3], gx = move[4], gy = move[5];
-    double *told = w->told, *limited = w->told_limited, *by = w->by_unknowns, *weight = w->weight;
+    double *adjoint = w->adjoint, *limited = w->adjoint_limited, *by = w->by_unknowns, *weight = w->weight;
     const Index v = 2 * i * K + k, omega = (2 * i + 1) * K + k;
     to->white[v] = of->white[v] * (sx * limited[x] + sy * limited[y]);
     to->white[omega] = of->white[omega] * (gx * limited[x] + gy * limited[y] + of->period * limited[h]);
-    told[h] += -dy * told[x] + dx * told[y];
+    adjoint[h] += -dy * adjoint[x] + dx * adjoint[y];
     limited[h] += -dy * limited[x] + dx * limited[y];
     add(by + h * size, -dy, by + x * size, size);
     add(by + h * size, dx, by + y * size, size);
@@ -617,13 +617,13 @@ SIZED void attributed(const Measured *of, const Walk *walk, Index i, Index k, Wo
 SIZED void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
 {
     const Index s = states(of), size = estimated(of);
-    memset(w->told, 0, sizeof(double) * s);
-    memset(w->told_limited, 0, sizeof(double) * s);
+    memset(w->adjoint, 0, sizeof(double) * s);
+    memset(w->adjoint_limited, 0, sizeof(double) * s);
     memset(w->by_unknowns, 0, sizeof(double) * s * size);
     memset(w->weight, 0, sizeof(double) * s * s);
     for (Index k = of->ticks; k >= 0; k--) {
         for (Index j = of->begin[k + 1] - 1; j >= of->begin[k]; j--) {
-            told_by(of, walk, j, w, to);
+            weighed_in(of, walk, j, w, to);
             whitened(w->whitening, size, w->effect, w->vector);
             to->explained[j] = dot(w->vector, w->vector, size);
         }
@@ -633,8 +633,8 @@ SIZED void backward(const Measured *of, const Walk *walk, Work *w, Step *to)
             attributed(of, walk, i, k - 1, w, to);
         }
         for (Index a = 3 * of->robots; a < s; a++) {
-            w->told[a] *= of->decay;
-            w->told_limited[a] *= of->decay;
+            w->adjoint[a] *= of->decay;
+            w->adjoint_limited[a] *= of->decay;
             scale(w->by_unknowns + a * size, of->decay, size);
             scale(w->weight + a * s, of->decay, s);
             for (Index e = 0; e < s; e++) w->weight[e * s + a] *= of->decay;

@@ -508,35 +508,35 @@ def _backward(
     `misfits` remain after the whole step, and those `of_limited` after the limited one.
     """
     s, count = len(passed.p), len(of.rho)
-    told = Told([0.0] * s, [0.0] * s, zeros(s, of.size), zeros(s, s))
+    adjoint = Adjoint([0.0] * s, [0.0] * s, zeros(s, of.size), zeros(s, s))
     white = [zeros(2, of.ticks) for _ in range(of.robots)]
     own, multipliers, alone, explained = ([0.0] * count for _ in range(4))
     shocks = [zeros(of.ticks * of.strays, 5) for _ in range(of.robots)]
     for k in range(of.ticks, -1, -1):
         for j in range(of.begin[k + 1] - 1, of.begin[k] - 1, -1):
             gain, spread = passed.gain[j], passed.variance[j]
-            multipliers[j] = misfits[j] / spread - dot(gain, told.vector)
-            own[j] = of_limited[j] / spread - dot(gain, told.limited)
-            effect, alone[j] = _told_by(of, walk, passed, j, told, multipliers[j], own[j])
+            multipliers[j] = misfits[j] / spread - dot(gain, adjoint.vector)
+            own[j] = of_limited[j] / spread - dot(gain, adjoint.limited)
+            effect, alone[j] = _weighed_in(of, walk, passed, j, adjoint, multipliers[j], own[j])
             in_sigmas = whitened(whitening, effect)
             explained[j] = dot(in_sigmas, in_sigmas)
         if k > 0:
             for i in range(of.robots):
                 if of.strays:
-                    shocks[i][k - 1] = _shock(of, walk, i, k - 1, told, whitening)
-                _attributed(of, walk, i, k - 1, told, white[i])
+                    shocks[i][k - 1] = _shock(of, walk, i, k - 1, adjoint, whitening)
+                _attributed(of, walk, i, k - 1, adjoint, white[i])
             for a in range(3 * of.robots, s):
-                told.vector[a] *= of.decay
-                told.limited[a] *= of.decay
-                scale(told.by_unknowns[a], of.decay)
-                scale(told.weight[a], of.decay)
-                for row in told.weight:
+                adjoint.vector[a] *= of.decay
+                adjoint.limited[a] *= of.decay
+                scale(adjoint.by_unknowns[a], of.decay)
+                scale(adjoint.weight[a], of.decay)
+                for row in adjoint.weight:
                     row[a] *= of.decay
     return white, own, multipliers, alone, explained, shocks
 
 
-class Told(NamedTuple):
-    """The information of later ranges about the state."""
+class Adjoint(NamedTuple):
+    """The adjoint variables of the backward pass: the information of later ranges about the state."""
 
     vector: Vector
     """the derivative of the log-likelihood by the state, after the whole step; shape (s,)"""
@@ -548,10 +548,10 @@ class Told(NamedTuple):
     """the information; shape (s, s)"""
 
 
-def _told_by(
-    of: Measured, walk: Walk, passed: Passed, j: int, told: Told, multiplier: float, own: float
+def _weighed_in(
+    of: Measured, walk: Walk, passed: Passed, j: int, adjoint: Adjoint, multiplier: float, own: float
 ) -> tuple[Vector, float]:
-    """Add what range `j` tells.
+    """Add the information of range `j` to `adjoint`.
 
     Return the effects of the unknowns on it, multiplied by the inverse covariance of all ranges, and the
     diagonal of that.
@@ -559,25 +559,25 @@ def _told_by(
     gain, spread = passed.gain[j], passed.variance[j]
     effect = [one / spread for one in passed.effects[j][: of.size]]
     for a in range(len(gain)):
-        add(effect, -gain[a], told.by_unknowns[a])
-    weighted = [dot(row, gain) for row in told.weight]
+        add(effect, -gain[a], adjoint.by_unknowns[a])
+    weighted = [dot(row, gain) for row in adjoint.weight]
     precision = 1.0 / spread + dot(gain, weighted)
     row = _row(of, walk, j)
     for a, h in row:
-        told.vector[a] += h * multiplier
-        told.limited[a] += h * own
-        add(told.by_unknowns[a], h, effect)
-        add(told.weight[a], -h, weighted)
+        adjoint.vector[a] += h * multiplier
+        adjoint.limited[a] += h * own
+        add(adjoint.by_unknowns[a], h, effect)
+        add(adjoint.weight[a], -h, weighted)
         for e in range(len(gain)):
-            told.weight[e][a] -= h * weighted[e]
+            adjoint.weight[e][a] -= h * weighted[e]
     for a, h in row:
         for e, other in row:
-            told.weight[a][e] += h * other * precision
+            adjoint.weight[a][e] += h * other * precision
     return effect, precision
 
 
-def _shock(of: Measured, walk: Walk, i: int, k: int, told: Told, whitening: Matrix) -> Vector:
-    """Return the row of `shocks` of robot `i` in tick `k`, by what is told of the state after it."""
+def _shock(of: Measured, walk: Walk, i: int, k: int, adjoint: Adjoint, whitening: Matrix) -> Vector:
+    """Return the row of `shocks` of robot `i` in tick `k`, by the `adjoint` of the state after it."""
     sx, sy, _, _, gx, gy, _, _ = walk.moves[i, k]
     effects = ((sx, sy), (gx, gy, of.period))
     shock: Vector = []
@@ -585,24 +585,24 @@ def _shock(of: Measured, walk: Walk, i: int, k: int, told: Told, whitening: Matr
     for e in range(2):
         slope, by = 0.0, [0.0] * of.size
         for a, h in enumerate(effects[e], 3 * i):
-            slope += h * told.vector[a]
-            add(by, h, told.by_unknowns[a])
+            slope += h * adjoint.vector[a]
+            add(by, h, adjoint.by_unknowns[a])
         shock.append(slope)
         by_unknowns.append(whitened(whitening, by))
     for e, f in ((0, 0), (0, 1), (1, 1)):
         information = 0.0
         for a, h in enumerate(effects[e], 3 * i):
             for b, g in enumerate(effects[f], 3 * i):
-                information += h * g * told.weight[a][b]
+                information += h * g * adjoint.weight[a][b]
         shock.append(information - dot(by_unknowns[e], by_unknowns[f]))
     return shock
 
 
-def _attributed(of: Measured, walk: Walk, i: int, k: int, told: Told, white: Matrix) -> None:
-    """Set the `white` errors of robot `i` in tick `k`, and move what is told to the state before it."""
+def _attributed(of: Measured, walk: Walk, i: int, k: int, adjoint: Adjoint, white: Matrix) -> None:
+    """Set the `white` errors of robot `i` in tick `k`, and move `adjoint` to the state before it."""
     sx, sy, dx, dy, gx, gy, _, _ = walk.moves[i, k]
     x, y, h = 3 * i, 3 * i + 1, 3 * i + 2
-    vector, limited, by_unknowns, weight = told
+    vector, limited, by_unknowns, weight = adjoint
     white[0][k] = of.white[i, 0, k] * (sx * limited[x] + sy * limited[y])
     white[1][k] = of.white[i, 1, k] * (gx * limited[x] + gy * limited[y] + of.period * limited[h])
     vector[h] += -dy * vector[x] + dx * vector[y]

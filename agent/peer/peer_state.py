@@ -17,7 +17,7 @@ class PeerState(msgspec.Struct, frozen=True):
     """The pose of the peer at tick 0 in the frame of the peer's anchor; None before the peer's phase 2."""
     phase: int = 1
     state: str = ""
-    """The name of the peer's mode, like `phase` from the latest report."""
+    """The name of the peer's task, like `phase` from the latest report."""
     verdict: Verdict | None = None
     """The verdict of the peer in the latest report."""
     latest: int = -1

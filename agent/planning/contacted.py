@@ -64,7 +64,7 @@ class Contacted(msgspec.Struct, frozen=True):
     failure: str = "no localised robot has found it"
     """The reason for which it has no claim yet."""
 
-    def told(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
+    def informed(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
         found = self
         for report in reports:

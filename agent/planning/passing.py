@@ -43,7 +43,7 @@ With as few as BLOCKED_AFTER, noise of the ranges turns robots to and fro that h
 CLEARANCE = 0.25
 """The distance by which a way aside is longer than needed, as a fraction of R."""
 
-PATIENCE = 8
+MOST_YIELDED = 8
 """The ticks for which a blocked robot stands still if one with a smaller id is near.
 
 With 60, groups take as long.
@@ -109,7 +109,7 @@ def passed(
     if blocked < (BLOCKED_ASIDE_AFTER if passing.places else BLOCKED_AFTER) or controls.v == 0.0:
         return replace(passing, leeway=free, blocked=blocked, yielded=yielded)
     waits = separation.is_tight(leeway({one: ranges[one] for one in before}, mission), mission)
-    if waits and yielded < PATIENCE:
+    if waits and yielded < MOST_YIELDED:
         return replace(passing, leeway=0.0, blocked=blocked, yielded=yielded + 1)
     course = here if controls.v > 0.0 else compose(here, Pose(0.0, 0.0, math.pi))
     places = aside(course, mission, 1.0 if passing.detours % 2 == 0 else -1.0)

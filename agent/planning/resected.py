@@ -57,7 +57,7 @@ class Resected(msgspec.Struct, frozen=True):
     unconfirmed: Mapping[str, Pose] = {}
     """The only hypothesis that the reports of each robot leave: the pose in <W> of the odometry's frame."""
 
-    def told(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
+    def informed(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose."""
         places, found = dict(self.places), self
         if not isinstance(state.task, Looping):  # a robot that comes back may have corrected its pose

@@ -56,7 +56,7 @@ class Spiral(NamedTuple):
 
 
 class Near(NamedTuple):
-    """The place of the shortest range to an anchor, or to a robot, where both are in the same tick."""
+    """The shortest range of this robot to an anchor or to another robot, and where it measured that."""
 
     range: float = math.inf
     """The range in m; infinite before there is one."""

@@ -246,22 +246,22 @@ def _way(state: TeamState) -> Way | None:
     While there are ranges to that anchor, its place is estimated again.
     """
     mission, anchors = state.config.mission, state.team.anchors
-    entries, rooms = state.log.logs[state.own], dict[int, list[tuple[int, float]]]()
+    entries, ranges_of = state.log.logs[state.own], dict[int, list[tuple[int, float]]]()
     for tick, entry in enumerate(entries):
         for one in entry.anchors:
             if anchors[one.to].position is not None:
-                rooms.setdefault(one.to, []).append((tick, one.range))
-    if len(entries) <= loop_ticks(mission, state.own) or not rooms:
+                ranges_of.setdefault(one.to, []).append((tick, one.range))
+    if len(entries) <= loop_ticks(mission, state.own) or not ranges_of:
         return state.way
-    first = max(rooms, key=lambda anchor: (len(rooms[anchor]), -anchor))
+    first = max(ranges_of, key=lambda anchor: (len(ranges_of[anchor]), -anchor))
     known = [one for one in anchors if one.id in state.config.ranges]
     distance = nearest_other(anchors[first], known)
-    if distance is None or (state.way is not None and rooms[first][-1][0] < state.tick):
+    if distance is None or (state.way is not None and ranges_of[first][-1][0] < state.tick):
         return state.way
     driven = [one.executed for one in entries if one.executed is not None]
     v, omega = (np.array([getattr(one, name) for one in driven]) + 0.0 for name in ("v", "omega"))
     path = track(v, omega, mission.period)
-    alone = near_anchors((path,), (rooms[first],), ((0.0, 0.0),), mission.noise, mission.sensing_range)
+    alone = near_anchors((path,), (ranges_of[first],), ((0.0, 0.0),), mission.noise, mission.sensing_range)
     found = of_anchor((), alone.alone(0))
     if not found:
         return state.way

@@ -1,7 +1,7 @@
-"""A robot of a group without an anchor: it waits until a localised robot finds it, and believes its pose.
+"""A robot of a group without an anchor: it waits until a localised robot finds it.
 
-How it determines its own depends on what the other one can say: `resected`, of a pose that is exact, or
-`contacted`, of one that has a covariance. Once localised, it may look for others.
+How it determines its pose depends on what its finder reports: an exact pose (`resected`), or one with a
+covariance (`contacted`). Once localised, it may look for others.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class UnanchoredPlanner(LogPlanner):
         if state.agenda.robot_verdict is None:
             late = state.elapsed >= state.config.gives_up
             found = _found(state)
-            state = state.undecided(found.why_undecided(state)) if late else found.told(state, reports)
+            state = state.undecided(found.why_undecided(state)) if late else found.informed(state, reports)
             state = state if state.verdict is None else state.with_agenda(robot_verdict=state.verdict)
         return _searching(state, reports) if searching.takes_part(state) else state
 

@@ -14,7 +14,7 @@ import numpy as np
 from msgspec.structs import replace
 
 from agent.estimation.elementary import eigh, product
-from agent.estimation.fit import Fit, Start, fits, with_told_priors
+from agent.estimation.fit import Fit, Start, fits, with_unscaled_priors
 from agent.estimation.gaussian.consistency import chi2_p_value
 from agent.estimation.gaussian.joint_claims import decisive_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -62,7 +62,9 @@ def fits_without_parts(fit: Fit, robot: int, measured: JointMeasurements) -> tup
             rest = replace(measured, ranges=ranges.rows(left), solver=None)
             if decisive_ranges(robot, rest) < FEWEST_DECISIVE:
                 continue
-            found += [(f"{ORDINALS[part]} {name}", one) for one in map(with_told_priors, fits(rest, [start]))]
+            found += [
+                (f"{ORDINALS[part]} {name}", one) for one in map(with_unscaled_priors, fits(rest, [start]))
+            ]
     return tuple(found)
 
 

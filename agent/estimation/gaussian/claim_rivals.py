@@ -1,6 +1,6 @@
 """The rivals of a claim: the likeliest poses that are so far from it that it would be wrong.
 
-The covariance of a fit describes the likelihood near its maximum. Where the possible poses lie along a bent
+The covariance of a fit describes the likelihood near its maximum. Where the poses that fit lie along a bent
 valley, or where an outlier passes as an inlier because the fit has moved towards it, poses many sigmas away
 may be nearly as likely as the claimed ones. They are found by fits in which one coordinate of a robot is held
 there and everything else is free, the weights of the ranges included (a profile likelihood).

@@ -36,7 +36,7 @@ class Displacement(NamedTuple):
 
     @property
     def what(self) -> str:
-        """The words for it."""
+        """The displacement in words, with the anchors that may stand elsewhere instead."""
         away = f"by its ranges, {math.hypot(*self.vector):.2g} m from its position ({self.sigmas:.1f} sigmas)"
         return f"{away}; instead, it may be {' or '.join(self.others)}" if self.others else away
 

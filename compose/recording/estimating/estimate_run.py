@@ -89,9 +89,9 @@ def _result(measured: Measurements, estimator: RecordingEstimator) -> RecordingE
 
 
 def _may_forget(measured: Measurements) -> bool:
-    """Return whether the last KEPT_S tell all that is known of the robots, as far as it tells poses now.
+    """Return whether the measurements of the last KEPT_S determine the present poses without the older ones.
 
-    They do not in the frame of a robot, nor if an anchor is not surveyed, or a robot hardly moves in them.
+    They do not in the frame of a robot, with an anchor that is not surveyed, or if a robot has hardly moved.
     """
     joint = measured.joint
     if measured.relative_to is not None or joint.surveyed:

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import msgspec
 import numpy as np
 
-from agent.estimation.fit import Fit, with_told_priors
+from agent.estimation.fit import Fit, with_unscaled_priors
 from agent.estimation.following import ClaimRule, Following
 from agent.estimation.gaussian.joint_claims import open_position, undetermined
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -116,7 +116,7 @@ def _result(
     }
     posed = [one for one in measured.robots if not without[one.id]]
     unseen = {one.id: one.unseen.sigmas(np.array([t]))[0] for one in posed}
-    fits = [with_told_priors(each.fit) for each in found.hypotheses]
+    fits = [with_unscaled_priors(each.fit) for each in found.hypotheses]
     blocking = {name: why_unseen_blocks(fits[0], place[name], one, accuracy) for name, one in unseen.items()}
     reasons = {name: reason or blocking.get(name, "") for name, reason in reasons.items()}
     without = {name: why for name, why in without.items() if why}

@@ -139,7 +139,7 @@ class RecordingBuilder:
         path.append((row, covariance))
 
     def forget(self, before_s: float) -> None:
-        """Forget what was measured before this time, but for the last increment of each robot."""
+        """Drop the measurements and true poses before `before_s`, but keep the last ones of each path."""
         for rows in self._odometry.values():
             rows[:-1] = [one for one in rows[:-1] if one[0].t1 > before_s]
         for path in self._truth.values():
