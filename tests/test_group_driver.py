@@ -64,13 +64,14 @@ class Member:
         max_ticks: int,
         verdict: Verdict | None = None,
         journal: Sink | None = None,
+        tolerates: int = 0,
     ) -> None:
         self.driver = Recorded()
         self.driver.clock = stage.monotonic
         self._stage, self._robot, self._verdict = stage, robot, verdict
         self.field = Field(
             self.driver,
-            config_in_group(robot),
+            replace(config_in_group(robot), tolerates=tolerates),
             "r",
             stage,
             max_ticks=max_ticks,
@@ -116,8 +117,8 @@ def begins(stage: Stage, robot: str, ticks: Mapping[int, float]) -> None:
 def test_each_robot_counts_the_ticks_of_the_first_one_that_it_hears() -> None:
     source, later = TickSource(config_in_group("c"), 1.0), 1.0 + UNHEARD
     assert source.leads("b", 0.0)
-    source.hear("a", 1.0)
-    source.hear("b", 1.0)
+    source.hear("a", 7, 1.0)
+    source.hear("b", 7, 1.0)
     assert [source.leads(robot, 2.0) for robot in "abd"] == [True, False, False]
     assert [source.leads(robot, later) for robot in "abd"] == [True, True, False]
     assert not source.is_first
@@ -194,6 +195,93 @@ def test_a_robot_of_a_group_that_is_alone_does_not_begin(stage: Stage) -> None:
     with pytest.raises(NoStart, match="a and c and d: not connected; no robot has moved"):
         member.play(2.0)
     assert member.driver.commands == []
+
+
+# --- false TickStarts ---------------------------------------------------------------------------------
+
+
+def in_step(stage: Stage, robots: str, ticks: int, since: float = 0.1) -> None:
+    """Let the drivers of honest `robots` begin tick 0 at the time `since`, one just after the other."""
+    for place, robot in enumerate(robots):
+        begins(stage, robot, {tick: since + 0.001 * place + tick * TICK_S for tick in range(ticks)})
+
+
+@pytest.mark.parametrize("robot", ["a", "b", "c"])
+@pytest.mark.parametrize("ahead", [1, 3, 20])
+def test_a_robot_that_says_it_is_ahead_leads_none_of_those_that_tolerate_it(
+    ahead: int, robot: str, stage: Stage
+) -> None:
+    """Robot d is ahead from before the start on, and ever more."""
+    member = Member(stage, robot, 30, tolerates=1)
+    begins(stage, "d", {ahead * (1 + k): 0.05 + 0.5 * k * TICK_S for k in range(60)})
+    stage.comes("alive", keys.robot_alive("r", robot))
+    for other in "abcd".replace(robot, ""):
+        stage.comes("alive", keys.robot_alive("r", other), after=0.09)
+    in_step(stage, "abc".replace(robot, ""), 30)
+    assert member.play().tick == 30
+    assert member.times[30] - member.times[5] == pytest.approx(25 * TICK_S, rel=0.01)
+    assert member.field.missed <= 1
+    assert member.started()[-25:] == list(range(6, 31))
+
+
+@pytest.mark.parametrize("robot", ["b", "c", "d"])
+@pytest.mark.parametrize("lasts", [0.2, 0.9, 1.4])
+def test_a_first_robot_with_a_false_clock_changes_no_ticks_of_those_that_tolerate_it(
+    lasts: float, robot: str, stage: Stage
+) -> None:
+    """Robot a sends each TickStart twice, and its ticks last too short or too long."""
+    member = Member(stage, robot, 30, tolerates=1)
+    stage.alive("a", "b", "c", "d")
+    for repeated in (0.0, 0.1 * TICK_S):
+        begins(stage, "a", {tick: 0.1 + repeated + lasts * tick * TICK_S for tick in range(60)})
+    in_step(stage, "bcd".replace(robot, ""), 31)
+    assert member.play().tick == 30
+    assert member.times[30] - member.times[0] == pytest.approx(30 * TICK_S, rel=0.01)
+    assert member.field.missed == 0
+
+
+def test_a_robot_that_was_down_catches_up_with_honest_ones_beside_a_false_one(stage: Stage) -> None:
+    b = Member(stage, "b", 60, tolerates=1)
+    b.field.resume(driver_history([], config_in_group("b"), Path("b")), latest=-1)
+    stage.alive("a", "b", "c", "d")
+    begins(stage, "a", {tick: 0.05 + (tick - 50) * TICK_S for tick in range(50, 90)})
+    for robot in "cd":
+        begins(stage, robot, {tick: 0.1 + (tick - 40) * TICK_S for tick in range(40, 61)})
+    assert b.play().tick == 60
+    assert b.times[60] == pytest.approx(0.1 + 20 * TICK_S, abs=0.1 * TICK_S)
+    assert b.field.missed <= 43
+
+
+def test_a_robot_that_is_ahead_of_all_others_waits_for_them_in_a_group_that_tolerates_false_ones(
+    stage: Stage,
+) -> None:
+    a = Member(stage, "a", 20, tolerates=1)
+    stage.alive("a", "b", "c", "d")
+    in_step(stage, "bcd", 20, since=1.5 * TICK_S)
+    a.play()
+    assert a.times[18] == pytest.approx(19.5 * TICK_S, abs=0.1 * TICK_S)
+
+
+def test_a_first_robot_that_repeats_a_tick_start_delays_others_for_a_bounded_time(stage: Stage) -> None:
+    c = Member(stage, "c", 9)
+    stage.alive("a", "b", "c", "d")
+    begins(stage, "a", {tick: 0.1 + tick * TICK_S for tick in range(4)})
+    repeated = encode(TickStart(3, "a"))
+    for half in range(200):
+        stage.comes("tick-start", keys.tick_start("r", "a"), repeated, (4 + half / 2) * TICK_S)
+    assert c.play().tick == 9
+    assert c.times[9] == pytest.approx(0.1 + 9 * TICK_S)
+
+
+def test_a_false_tick_start_before_the_first_one_hides_no_results(stage: Stage) -> None:
+    """Here the group tolerates no false robot, but the first one says at once that it begins."""
+    c = Member(stage, "c", 200, LOCALISED)
+    stage.alive("a", "b", "c", "d")
+    begins(stage, "d", {150: 0.1})
+    in_step(stage, "ab", 1)
+    for robot in "abd":
+        stage.comes("tick-start", keys.tick_start("r", robot), encode(result(robot)), 0.1 + 7 * TICK_S)
+    assert c.play().tick < 20
 
 
 # --- the end ------------------------------------------------------------------------------------------

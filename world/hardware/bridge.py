@@ -117,7 +117,7 @@ class Field:
         self._ahead = -1
         """The latest tick of another robot to which this one has had to catch up; -1 if none."""
         self._latest = -1
-        """The latest tick in a TickStart that fits; -1 if there is none."""
+        """The latest tick in a TickStart that fits, or in which others are if some may be false; -1: none."""
         self._alive: set[str] = set()
         """The robots with a liveliness token."""
         self._unanswered: deque[tuple[int, bytes]] = deque()
@@ -375,32 +375,55 @@ class Field:
 
         The next tick begins as many ticks later as its number is higher, and at once if it is lower. A robot
         that is behind sets its clock from any other one: if it was restarted, and in a group also if it
-        begins late or is more than MOST_TICKS_AHEAD ticks behind.
+        begins late or is more than MOST_TICKS_AHEAD ticks behind. In a group that tolerates false robots,
+        all set their clocks from several ones.
         """
         start: TickStart | None = self._inbox.accepted(arrival, TickStart, MAX_REPORT_BYTES)
         if start is None:
             return
+        if not (self._agrees(start) if self._source.tolerates else self._follows(start)):
+            self._inbox.refuse(arrival, f"it is of tick {start.tick}, this is tick {max(self._tick, 0)}")
+        if self._is_current(start.tick):
+            self._use(start, arrival.frame)
+
+    def _follows(self, start: TickStart) -> bool:
+        """Set the clock from `start` if this robot goes by that of its sender; False if it does not fit."""
         left, now, in_group = self._tick + 1 - start.tick, self._inbox.clock(), self._source.joins
-        fits = (
-            -self._astray <= left <= (MOST_TICKS_AHEAD if self._resumed or self._astray == ASTRAY else ASTRAY)
-        )
+        most = MOST_TICKS_AHEAD if self._resumed or self._astray == ASTRAY else ASTRAY
+        fits = -self._astray <= left <= most and self._source.is_newer(start.robot, start.tick, now)
         begins = in_group and self._next == UNKNOWN
         behind = left < 0 and (self._resumed or (in_group and left < -MOST_TICKS_AHEAD))
         if fits:
-            self._source.hear(start.robot, now)
+            self._source.hear(start.robot, start.tick, now)
             self._latest = max(self._latest, start.tick)
-            if behind or (begins and left < 0):
-                self._ahead = max(self._ahead, start.tick)
-        if self._is_current(start.tick):
-            self._use(start, arrival.frame)
         if not (begins or behind or self._source.leads(start.robot, now)):
-            return
-        if not fits:
-            self._inbox.refuse(arrival, f"it is of tick {start.tick}, this is tick {max(self._tick, 0)}")
-            return
-        self._resumed |= in_group and (behind or (begins and left < 0))
-        self._astray = ASTRAY
-        self._next = now + left * self._tick_s
+            return True
+        if fits:
+            catches_up = behind or (begins and left < 0)
+            self._ahead = start.tick if catches_up else -1
+            self._resumed |= in_group and catches_up
+            self._astray = ASTRAY
+            self._next = now + left * self._tick_s
+        return fits
+
+    def _agrees(self, start: TickStart) -> bool:
+        """Set the clock from those of several robots, of which some may be false; False if `start` is late.
+
+        One suffices to begin when all are connected: an honest one begins then, too.
+        """
+        left, now = self._tick + 1 - start.tick, self._inbox.clock()
+        if left > MOST_TICKS_AHEAD or not self._source.is_newer(start.robot, start.tick, now):
+            return False
+        self._source.hear(start.robot, start.tick, now)
+        known = self._next != UNKNOWN
+        before = self._next - (self._tick + 1) * self._tick_s if known else None
+        began = self._source.agreed(before, now)
+        if began is None and start.tick <= MOST_TICKS_AHEAD and self._alive.issuperset(self._others):
+            began = now - start.tick * self._tick_s
+        if began is not None and began != before:
+            self._ahead = self._latest = math.floor((now - began) / self._tick_s)
+            self._next = began + (self._tick + 1) * self._tick_s
+        return True
 
     def _is_current(self, tick: int) -> bool:
         """Return whether `tick` is near this robot's, or that of the robots with which it catches up."""
