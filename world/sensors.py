@@ -43,9 +43,8 @@ def _anchor_range(truth: Truth, scenario: Scenario, i: int, name: str, anchor: A
     rho = math.hypot(x, y)
     pattern = sensors.anchor_lobes[name].reach(math.atan2(y, x)) if sensors.world.lobe_depth else 1.0
     surveyed, before = (anchor.x + off_x, anchor.y + off_y), truth.before(sensors.world.range_delay)[i]
-    at = (x + surveyed[0], y + surveyed[1])
-    late = math.hypot(x + (before.x - pose.x), y + (before.y - pose.y))
-    found = _measured(scenario, truth.tick, sensor, (at, surveyed), (rho, late, pattern))
+    at, late = (x + surveyed[0], y + surveyed[1]), (x + (before.x - pose.x), y + (before.y - pose.y))
+    found = _measured(scenario, truth.tick, sensor, (at, surveyed), (rho, pattern), late)
     return None if found is None else found.range
 
 
@@ -94,9 +93,8 @@ def mutual_ranges(truth: Truth, scenario: Scenario, pairs: Sequence[tuple[int, i
             of_one = sensors.robot_lobes[i].reach(to_other - one.heading)
             of_other = sensors.robot_lobes[j].reach(to_one - other.heading)
             pattern = 0.5 * (of_one + of_other)
-        late = math.hypot(before[i].x - before[j].x, before[i].y - before[j].y)
-        ends, distances = (places[i], places[j]), (rho, late, pattern)
-        ranges.append(_measured(scenario, truth.tick, sensors.mutual[i, j], ends, distances))
+        late, ends = (before[i].x - before[j].x, before[i].y - before[j].y), (places[i], places[j])
+        ranges.append(_measured(scenario, truth.tick, sensors.mutual[i, j], ends, (rho, pattern), late))
     return ranges
 
 
@@ -111,21 +109,22 @@ def _measured(
     tick: int,
     sensor: RangeSensor,
     places: tuple[Point, Point],
-    distances: tuple[float, float, float],
+    detection: tuple[float, float],
+    late: Point,
 ) -> Mutual | None:
     """Return the measurement of two radios at `places`; None if they do not detect each other.
 
-    The `distances` are theirs in m, that of the time of the measurement, and the relative range of their
-    patterns in this direction.
+    `detection` has their distance in m, and the relative range of their patterns in this direction. `late` is
+    the vector between them in m at the time of the measurement.
     """
-    sensors, model, (rho, late, pattern), radios = scenario.sensors, scenario.ranging, distances, None
+    sensors, model, (rho, pattern), radios = scenario.sensors, scenario.ranging, detection, None
     if model is not None:
         radios = Radios(f"{sensor.sensor}/{sensor.robot}", *places, tick, scenario.seed)
     if not sensors.detects(sensor, tick, rho, pattern, model, radios):
         return None
     if sensors.exact:
         return Mutual(rho)
-    measured = sensors.measured(sensor, late, tick)
+    measured = sensors.measured(sensor, math.hypot(*late), tick)
     if measured is not None and model is not None and radios is not None:
         modelled = model.measured(radios, measured)
         measured = None if modelled is None else min(max(0.0, float(modelled)), LONGEST_RANGE)
