@@ -466,6 +466,14 @@ def test_ranges_at_rest_do_not_replace_those_from_other_places() -> None:
     assert rested.thinned(REACH).ranges.tick[:places].tolist() == list(range(places))
 
 
+def test_a_robot_that_shuttles_at_one_place_has_ranges_from_one_place_as_one_that_stands() -> None:
+    """The way adds up to many places, but it is never farther than MOVED * R from where it began."""
+    places = MOST_CORRELATED_RANGES // 2
+    shuttled = driving([0.1 * REACH] * places + [0.004 * REACH, -0.004 * REACH] * 500)
+    assert shuttled.places_of_pairs == [((0, 1), places + 1)]
+    assert shuttled.thinned(REACH).ranges.tick[:places].tolist() == list(range(places))
+
+
 @pytest.mark.parametrize("slower", [0.3, 1.1])
 def test_slow_motion_adds_up_to_another_place(slower: float) -> None:
     slow = replace(driving([slower * MOVED * REACH] * 40), reach=REACH)

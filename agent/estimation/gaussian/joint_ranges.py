@@ -337,25 +337,17 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
     def _weighed(self, ends: tuple[int, int], rows: Places, most: int) -> Places:
         """Return at most `most` of the `rows` of the pair of radios at both `ends`.
 
-        Places are left out only where one range of each is still too many. A place is a stretch of
-        MOVED * reach of the way, to which in each step the end adds that moves more.
+        Places (see `from_places`) are left out only where one range of each is still too many.
         """
         if len(rows) <= most:
             return rows
-        way = self._positions(ends, self.ranges.tick[rows])
-        parts = np.cumsum(_longest(np.diff(way))) // (MOVED * self.reach)
-        begins = np.append(0, 1 + np.flatnonzero(np.diff(parts, prepend=0.0)))
+        begins = self.from_places(ends, self.ranges.tick[rows])
         counts, of_place = np.diff(begins, append=len(rows)), most
         while of_place > 1 and np.minimum(counts, of_place).sum() > most:
             of_place //= 2
         of_each = [begin + _recent(count, of_place) for begin, count in zip(begins, counts, strict=True)]
         weighed: Places = rows[np.concatenate(of_each)]
         return weighed[_recent(len(weighed), most)]
-
-    def _positions(self, ends: tuple[int, int], ticks: Places) -> Array:
-        """Return the x and y at the `ticks` of the robots among both `ends`, shape (robots, 2, ticks)."""
-        paths = [self.paths[end] for end in ends if end >= 0 and not self.is_anchor(end)]
-        return np.array([(path.x[ticks], path.y[ticks]) for path in paths])
 
     def from_places(self, ends: tuple[int, int], ticks: Places) -> Places:
         """Return the indices of the first of `ticks`, and of each at which one of both `ends` has moved.
@@ -364,8 +356,10 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         """
         if not len(ticks):
             return ticks
-        way, near = self._positions(ends, ticks), MOVED * self.reach
-        steps = _longest(np.diff(way))
+        paths = [self.paths[end] for end in ends if end >= 0 and not self.is_anchor(end)]
+        way, near = np.array([(path.x[ticks], path.y[ticks]) for path in paths]), MOVED * self.reach
+        each = np.diff(way)
+        steps = hypot(each[:, 0], each[:, 1]).max(axis=0)
         moved = np.append(True, steps > near)
         if np.any((steps > 0.0) & (steps <= near)):  # slow motion adds up
             places = way.transpose(2, 0, 1).tolist()
@@ -465,12 +459,6 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
 
 WEIGHED_OF_PAIR = 8
 """The number of ranges of a pair of robots that are always weighed."""
-
-
-def _longest(steps: Array) -> Array:
-    """Return the length of each of the `steps` of the robot that moves most in it; (robots, 2, any)."""
-    longest: Array = hypot(steps[:, 0], steps[:, 1]).max(axis=0)
-    return longest
 
 
 def _recent(count: int, most: int) -> Places:
