@@ -19,7 +19,7 @@ from protocol.units import Fraction, Probability, Sigma
 Floor = Annotated[float, Meta(ge=0.0, le=1e4)]
 Bias = Annotated[float, Meta(ge=0.0, le=1e6)]
 Degrees = Annotated[float, Meta(ge=0.0, le=1e6)]
-Drift = Annotated[float, Meta(ge=0.0, le=1e4)]
+GyroBias = Annotated[float, Meta(ge=0.0, le=1e4)]
 Delay = Annotated[float, Meta(ge=0.0, le=1e4)]
 Correlation = Annotated[float, Meta(ge=1e-6, le=1e6)]
 
@@ -122,7 +122,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The time in s in which the correlation of this error falls to 1 / e."""
     wheel_scale: Fraction | None = None
     """The prior of the relative scale errors of a robot's odometry, of v and of omega."""
-    gyro_bias: Drift | None = None
+    gyro_bias: GyroBias | None = None
     """The prior of the bias of omega, in rad/s, while the robot moves."""
     sigma_degrees: Degrees = 4.0
     """The degrees of freedom of the prior of the factor of all sigmas; 0: the sigmas are exactly as told."""

@@ -51,18 +51,18 @@ def margin(mission: Mission, floor: float) -> float:
     return max(RANGE_MARGIN, mission.sensing_range * math.sqrt(2.0 * floor / mission.first_straight))
 
 
-class Known(msgspec.Struct, frozen=True):
-    """The smallest anchor error of a robot, and the number of its first anchor ranges that give it."""
+class AnchorAccuracy(msgspec.Struct, frozen=True):
+    """The smallest error of a robot's anchor by any number of its first ranges to it, and that number."""
 
     error: float
     """The bound in m on the error of the anchor's position."""
     ranges: int
-    """The number of ranges that give this error."""
+    """The number of first ranges that give this error."""
     enough: bool = False
     """True if phase 1 may end."""
 
 
-def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> Known:
+def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> AnchorAccuracy:
     """Return the smallest anchor error of the robot of `log`, whose branch begins at `start`.
 
     Phase 1 may end in three cases:
@@ -99,8 +99,8 @@ def anchor(knowledge: Knowledge, start: Pose, log: MotionLog) -> Known:
         stalled = len(ranged) >= FITTED and error > BETTER * before
         spent = len(ranged) - used == OUT_AND_BACK
         if bound <= WELL * enough or (stalled and bound <= enough) or spent:
-            return Known(bound, ranges, enough=True)
-    return Known(bound, ranges)
+            return AnchorAccuracy(bound, ranges, enough=True)
+    return AnchorAccuracy(bound, ranges)
 
 
 NEXT_TO = 0.25
@@ -119,7 +119,7 @@ def merged(knowledge: Knowledge, branches: tuple[Branch, ...]) -> tuple[Branch, 
     return (first, *(other for other in branches[1:] if math.dist(other.anchor, first.anchor) >= near))
 
 
-def fitted(knowledge: Knowledge, branch: Branch) -> tuple[Branch, Known]:
+def fitted(knowledge: Knowledge, branch: Branch) -> tuple[Branch, AnchorAccuracy]:
     """Return `branch` fitted to the ranges with the smallest anchor error, and that error."""
     accuracy = anchor(knowledge, branch.start, knowledge.log)
     if accuracy.ranges == len(knowledge.log.ranges):

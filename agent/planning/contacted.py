@@ -26,7 +26,7 @@ from protocol.coverage_ticks import contact_ticks
 from protocol.messages import Estimate, Localised, Report
 from protocol.motion import Covariance, Pose
 
-EACH = 3
+ESTIMATED_EACH = 3
 """The number of further ranges, and of ticks, after which the pose is estimated again.
 
 Each estimate is a search of all poses. With 1, claims would come two ticks earlier, at three times the time.
@@ -153,8 +153,8 @@ def _estimated(state: RobotState, found: Contacted) -> tuple[Contacted, Localise
         if first <= one.tick <= last
     ]
     if (
-        len(ranges) < max(FEWEST_FOR_POSE, found.ranges_at_estimate + EACH)
-        or state.tick < found.estimated_tick + EACH
+        len(ranges) < max(FEWEST_FOR_POSE, found.ranges_at_estimate + ESTIMATED_EACH)
+        or state.tick < found.estimated_tick + ESTIMATED_EACH
     ):
         return found, None
     own = MotionLog(state.tick, state.log.between(finder.reference, state.tick))

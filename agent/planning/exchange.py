@@ -141,15 +141,15 @@ class Steps(NamedTuple):
     """The steps of a planner that depend on the sensors: chosen once, by the estimator."""
 
     unranged: Callable[[RobotState], RobotState]
-    """It follows a tick of a robot that has not measured a range to its anchor yet."""
+    """The step after a tick of a robot that has not measured a range to its anchor yet."""
     phase1: Callable[[RobotState, Manoeuvres], RobotState]
-    """It continues phase 1 after a second or further range to the anchor."""
+    """The step of phase 1 after a second or further range to the anchor."""
     phase2: Callable[[RobotState, tasks.Orbital, bool], RobotState]
-    """It continues phase 2 from a task; the last argument says whether there is a new range to the anchor."""
+    """The step of phase 2 from a task; the last argument says whether there is a new range to the anchor."""
     phase3: Callable[[RobotState, Any], RobotState]
-    """It begins phase 3 in contact with the peer, if that can begin. It may plan by `joint_manoeuvres`."""
+    """The step that begins phase 3 in contact with the peer, if it can; it may plan by `joint_manoeuvres`."""
     turns: Callable[[RobotState, phase3_encounter.PlannedLast], RobotState] = phase3_encounter.decided
-    """It continues phase 3 of a robot that stands still in contact. It plans by `last_manoeuvre`."""
+    """The step of phase 3 of a robot that stands still in contact; it plans by `last_manoeuvre`."""
 
 
 class LogPlanner(Planner[RobotState, Report]):
@@ -249,7 +249,7 @@ class LogPlanner(Planner[RobotState, Report]):
         )
 
     def estimate(self, state: RobotState) -> Estimate:
-        """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
+        """Return the robot's pose under each hypothesis, in its anchor's frame and in <W>."""
         own, posterior, verdict = state.own_anchor, state.posterior, state.verdict
         branches_left = own.branches
         if not branches_left and own.branch is not None:
@@ -307,18 +307,15 @@ class LogPlanner(Planner[RobotState, Report]):
     def summary(self, state: RobotState) -> Summary:
         """Return the numbers of ranges and hypotheses, and the last manoeuvre."""
         own, posterior, plan = state.own_anchor, state.posterior, state.plan
+        counts = posterior.hypothesis_counts
         return Summary(
             anchor_ranges=len(state.log.ranges),
             branch=own.kind,
             alpha=own.branch.alpha if own.branch is not None else None,
-            candidates=posterior.hypothesis_counts,
+            candidates=counts,
             last_turn_rate=plan.command.omega if plan is not None else None,
             separation_m2=plan.separation_m2 if plan is not None else None,
-            hypotheses=(
-                len(posterior.pair or posterior.placements)
-                if posterior.hypothesis_counts is not None
-                else None
-            ),
+            hypotheses=counts and len(posterior.pair or posterior.placements),
             probability=posterior.pair[0].probability if posterior.pair else None,
             blocking_reason=posterior.blocking_reason,
             p_value=posterior.attempt.p_value,

@@ -170,7 +170,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         )
 
     def estimate(self, state: RobotState) -> Estimate:
-        """Return all poses that the robot considers possible in its anchor's frame and in <W>.
+        """Return the robot's pose under each hypothesis, in its anchor's frame and in <W>.
 
         Once it is localised, there is one. On the way to another robot, it has no covariance, because the
         planner does not compute how the noise of the odometry adds up.

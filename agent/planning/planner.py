@@ -113,7 +113,7 @@ class Planner(Generic[S, B]):
         raise NotImplementedError
 
     def estimate(self, state: S) -> Estimate:
-        """Return all poses that the robot considers possible in its anchor's frame and in <W>."""
+        """Return the robot's pose under each hypothesis, in its anchor's frame and in <W>."""
         raise NotImplementedError
 
     # --- optional ---

@@ -74,8 +74,8 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
         """Return what `peer` has not acknowledged, falsified if the configuration contains an attack."""
         log, attack, own = state.log, state.config.attack, state.own
         if attack is not None:
-            told = falsified_entries(log.logs[own], attack, state.config.mission.period)
-            log = replace(log, logs=(*log.logs[:own], told, *log.logs[own + 1 :]))
+            falsified = falsified_entries(log.logs[own], attack, state.config.mission.period)
+            log = replace(log, logs=(*log.logs[:own], falsified, *log.logs[own + 1 :]))
         return log.report(own, state.team.robots.index(peer))
 
     def decide(self, state: TeamState, reports: Sequence[TeamReport] = ()) -> TeamState:

@@ -106,7 +106,7 @@ def anchor_frame(robot: RobotSetup) -> Pose:
 
 
 def _robot(robot: RobotSetup, setup: RunSetup, player: Player) -> Iterator[Entity]:
-    """Yield a robot with its activity, ranges to anchors, and hypotheses, paler if less probable."""
+    """Yield a robot with its task, ranges to anchors, and hypotheses, paler if less probable."""
     rgb, path, held, pose = colours.rgb(player.hue(robot)), f"robots/{robot.id}", player.held, player.pose
     if pose is not None:
         at = (pose.x, pose.y)

@@ -19,13 +19,13 @@ class Numbers(msgspec.Struct, frozen=True):
     """The numbers of one robot in one tick. A number that is unknown in this tick is absent."""
 
     hypotheses: int | UnsetType = UNSET
-    """The number of poses that the robot considers possible."""
+    """The number of the robot's hypotheses."""
     probability: float | UnsetType = UNSET
     """The probability of the first of them."""
     position_error_m: float | UnsetType = UNSET
     """The distance of the leading pose in the world frame from the true position.
 
-    If no pose is more probable than all others together, it is that of the farthest possible pose.
+    If no pose is more probable than all others together, it is that of the farthest hypothesis.
     """
     position_bound_m: float | UnsetType = UNSET
     """SIGMAS times the robot's standard deviation of the first pose's position."""

@@ -41,7 +41,7 @@ class Decision(msgspec.Struct, frozen=True):
 
 
 class HeldPoses(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The poses that a robot considers possible."""
+    """The hypotheses of a robot, as poses."""
 
     local: tuple[Pose, ...]
     """The poses in the frame of the robot's anchor; see `RobotSetup.frame`."""
@@ -92,7 +92,7 @@ class Player(msgspec.Struct, frozen=True, omit_defaults=True):
 
     robot: str
     activity: str
-    """The robot's activity, as a sentence."""
+    """The robot's task, as a sentence."""
     pose: Pose | None = None
     """The true pose; its heading is wrapped."""
     sensed: bool = False

@@ -1,4 +1,4 @@
-"""Sentences that describe the activity of a robot."""
+"""Sentences that describe the task of a robot."""
 
 from __future__ import annotations
 

@@ -85,7 +85,7 @@ class Believing(planning.Planner[State, Word]):
         return replace(command, verdict=state.claim)
 
     def estimate(self, state: State) -> Estimate:
-        """Return the pose of a localised robot; before, what `assured` considers possible."""
+        """Return the pose of a localised robot; before, those of the hypotheses of `assured`."""
         estimate, pose = ASSURED.estimate(state.first), self.report(state).pose
         return replace(estimate, world=(pose,), localised=True) if pose is not None else estimate
 

@@ -81,8 +81,8 @@ def _least_chi2(
     for _ in range(AGREEMENT_STEPS):
         begin, end = minus(best, earlier.pose), compose(best, way)
         left = minus(end, now.pose)
-        drift = _drift(path, since, best.heading - heading, noise)
-        second = inverted(matrix(now) + drift)
+        of_odometry = _odometry_covariance(path, since, best.heading - heading, noise)
+        second = inverted(matrix(now) + of_odometry)
         chi2 = quadratic(first, begin) + quadratic(second, left)
         by_begin = np.eye(3)
         by_begin[0, 2], by_begin[1, 2] = best.y - end.y, end.x - best.x
@@ -156,7 +156,7 @@ def minus(one: Pose, other: Pose) -> Array:
     return np.array((one.x - other.x, one.y - other.y, wrap(one.heading - other.heading)))
 
 
-def _drift(path: Track, since: int, turn: float, noise: Noise) -> Array:
+def _odometry_covariance(path: Track, since: int, turn: float, noise: Noise) -> Array:
     """Return the covariance of the pose at the end of `path`, rotated by `turn`, by noise after `since`."""
     if not is_noisy(noise):
         return np.zeros((3, 3))

@@ -33,13 +33,13 @@ class Disagreement(NamedTuple):
     """The pose without a part of the ranges that differs most from a claim."""
 
     what: str
-    """The words for the part, and for the difference."""
+    """The part and the difference, in words."""
     p_value: float
     """The probability of such a difference, if the covariance is right."""
 
 
 MOST_KNOWN = 0.5
-"""The largest fraction of a variance without a part that counts as known with it, too.
+"""The largest fraction of a variance that is subtracted for the variance of a difference.
 
 The covariance of the difference of two poses, with and without a part, is the difference of theirs. That
 is uncertain if the part tells little, so at most this share of a variance is subtracted.

@@ -37,7 +37,7 @@ SAME_LEVEL = 0.05
 
 
 class ContactEstimate(NamedTuple):
-    """The poses of a robot without an anchor that are possible now, the most probable first."""
+    """The hypotheses about the pose of a robot without an anchor, the most probable first."""
 
     poses: tuple[Pose, ...]
     probabilities: tuple[float, ...]

@@ -20,7 +20,7 @@ from agent.estimation.gaussian.search import FEWEST_DECISIVE, OPEN, beacons, pos
 
 
 class Displacement(NamedTuple):
-    """The distance by which the ranges of an anchor favour another position than that which was told."""
+    """The distance by which the ranges of an anchor favour another position than the stated one."""
 
     anchor: str
     vector: tuple[float, float]
@@ -53,7 +53,7 @@ class Displacement(NamedTuple):
 
 
 DISPLACED_SIGMAS = 4.0
-"""The distance, in sigmas, from which on an anchor stands elsewhere than told.
+"""The distance, in sigmas, from which on an anchor stands elsewhere than stated.
 
 Honest anchors of LIAS have at most 1.1 after 40 s, and one that is 0.6 m off has 4.3 to 6.1.
 """

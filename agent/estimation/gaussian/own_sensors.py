@@ -68,7 +68,7 @@ class Doubt(NamedTuple):
     """The measurements that contradict the noise."""
     profile: ProfileName
     how: str
-    """The words for how much better the profile explains them."""
+    """The degree to which the profile explains them better, in words."""
 
     def reason(self, option: str = 'noise = "{}"') -> str:
         """Return the reason against a claim; `option` is how a user states a profile."""

@@ -1,4 +1,4 @@
-"""The accuracy that noise allows: the sigma of a reference mission, and that of a robot that sweeps an area.
+"""The accuracy that noise allows: the sigma of a reference mission, and that of a robot that covers an area.
 
 White noise averages out over many ranges, a bias does so only as far as the geometry tells it from distances.
 The reference mission has more ranges than a typical one, and no white odometry noise. With an accuracy far

@@ -20,7 +20,7 @@ from compose.recording.ranging.range_recording import Numbers, RangeRecording, l
 from compose.recording.ranging.range_steps import NEARLY_ALL, dead_reckoned, speeds
 
 PART_S, PARTS_OF_PATH = 40.0, 3
-"""The length in s of a part, in which odometry hardly drifts, and the largest number that are examined."""
+"""The length in s of a part, in which odometry errors are small, and the largest number that are examined."""
 
 FEWEST, MOST = 8, 48
 """The least number of ranges of a robot to an anchor in a part, and the largest that is used."""

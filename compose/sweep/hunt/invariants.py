@@ -128,7 +128,7 @@ def late(run: Run) -> Iterator[Breach]:
 
 
 def truth_lost(run: Run) -> Iterator[Breach]:
-    """The true pose is one of those that a robot considers possible, with exact sensors and honest peers."""
+    """The true pose is one of a robot's hypotheses, with exact sensors and honest peers."""
     scenario = run.scenario
     if not scenario.mission.noise.exact or any(one.attack is not None for one in scenario.robots):
         return

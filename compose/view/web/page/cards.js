@@ -152,7 +152,7 @@ class Card {
 /**
  * Returns the position error as text, and its explanation.
  *
- * The error is that of the leading pose, or, if no pose leads, the largest of all possible poses.
+ * The error is that of the leading pose, or, if no pose leads, the largest of all hypotheses.
  */
 function error(held, pose) {
   const off = held.world.map((one) => distance(one, pose)), least = metres(Math.min(...off)), most = metres(Math.max(...off));

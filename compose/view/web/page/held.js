@@ -1,4 +1,4 @@
-// The poses that a robot considers possible, interpolated between two ticks.
+// The hypotheses of a robot, interpolated between two ticks.
 
 import { between, compose, distance, frame_of, wrap } from "./geometry.js";
 
@@ -15,7 +15,7 @@ export const lacks_bearing = ({ world, local, probability }) => (
   !world.length && local.length > 0 && (probability[0] ?? 1 / local.length) > SURE
 );
 
-/** Returns the robot's possible poses on the plane and the first one's covariance; null without an estimate. */
+/** Returns the robot's hypotheses on the plane and the first one's covariance; null without an estimate. */
 export function held_now({ store, scene, truth, tick, share, moving }, robot) {
   const held = scene.players[store.places.get(robot.id)]?.held;
   if (!held) return null;

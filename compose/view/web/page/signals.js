@@ -15,7 +15,7 @@ const LABELLED = 0.2;
 export class Signals {
   constructor(plane) { this.plane = plane; }
 
-  /** Returns the possible poses at the measurement: the leading one, or up to MOST_ORIGINS if none leads. */
+  /** Returns the hypotheses at the measurement: the leading one, or up to MOST_ORIGINS if none leads. */
   #origins(view, robot) {
     const held = view.scene.players[view.store.places.get(robot.id)]?.held;
     if (!held) return [];
