@@ -151,13 +151,10 @@ def base(
     result is None if there is no such pair.
     """
     ranged: list[PairObservation] = []
-    for pair_observation in pair_observations:
-        if pair_observation.range is not None and not (
-            ranged
-            and (ranged[-1].a, ranged[-1].b)
-            == (pair_observation.a, pair_observation.b)  # neither robot has moved in between
-        ):
-            ranged.append(pair_observation)
+    for at in pair_observations:
+        has_moved = not ranged or (ranged[-1].a, ranged[-1].b) != (at.a, at.b)
+        if at.range is not None and has_moved:
+            ranged.append(at)
     for first, second in combinations(ranged, 2):
         if travelled(first.b, second.b) <= floor and travelled(first.a, second.a) > ELSEWHERE:
             near = B_ON_M1 * travelled(first.a, second.a)

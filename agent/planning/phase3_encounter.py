@@ -160,10 +160,8 @@ def decided(state: RobotState, planned: PlannedLast) -> RobotState:
         return state
     state, estimate = pair_estimate(evaluated, 0, second_range=True)
     if estimate is None:  # There are too few ranges, or b was still driving while a drove straight on.
-        b_is_standing = (
-            isinstance(state.task, tasks.Waiting) and state.peer_state.state == tasks.Standing.name
-        )
-        return begun(state) if b_is_standing else state
+        b_stands = isinstance(state.task, tasks.Waiting) and state.peer_state.state == tasks.Standing.name
+        return begun(state) if b_stands else state
     if state.verdict is not None:
         return state
     # A peer that has localised itself does not move again.

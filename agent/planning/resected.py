@@ -79,11 +79,8 @@ class Resected(msgspec.Struct, frozen=True):
 
     def answered(self, report: Report, peer: str) -> Report:
         """Return `report` to `peer`: a robot by which it knows a pose does not stop any longer."""
-        return (
-            replace(report, state=UNCONFIRMED)
-            if report.verdict is None and peer in self.unconfirmed
-            else report
-        )
+        is_unconfirmed = report.verdict is None and peer in self.unconfirmed
+        return replace(report, state=UNCONFIRMED) if is_unconfirmed else report
 
     def why_undecided(self, state: RobotState) -> str:
         """Return why the robot has not claimed a pose, for a user."""

@@ -54,13 +54,8 @@ class GaussianEstimator(msgspec.Struct, frozen=True):
         known = followed(knowledge)
         if known is None:
             return AnchorEstimate(knowledge.own_anchor, (), RANGE_MARGIN)
-        likely = tuple(
-            [
-                branch
-                for branch, one in zip(known.branches, known.hypotheses, strict=True)
-                if one.probability >= LIKELY_BRANCH
-            ]
-        )
+        each = zip(known.branches, known.hypotheses, strict=True)
+        likely = tuple([branch for branch, one in each if one.probability >= LIKELY_BRANCH])
         return AnchorEstimate(known, likely, RANGE_MARGIN, likely[0] if likely else None)
 
     def pair(self, knowledge: Knowledge, first_tick: int, *, second_range: bool) -> PairEstimate | None:
