@@ -44,7 +44,7 @@ from compose.sweep.trial import Trial, row
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import Contact, Localised, NamedRange, Observation
 from protocol.mission import Anchor
-from protocol.motion import Controls, Covariance, Pose
+from protocol.motion import REST, Controls, Covariance, Pose
 from protocol.team_motion import spiral
 from protocol.wire import decode, encode
 from tests.commands import journals
@@ -483,6 +483,22 @@ def test_in_any_order_of_lost_late_and_repeated_reports_a_log_is_the_beginning_o
             assert all(list(one) == truth[k][: len(one)] for k, one in enumerate(log.logs))
             at_once = TeamMeasurements().grown(log, config.team, mission)
             assert grown.joint(config.team, mission) == at_once.joint(config.team, mission)
+
+
+@pytest.mark.parametrize("hearsay", [True, False])
+def test_a_false_report_says_nothing_of_later_ticks_and_gives_the_receiver_no_result(hearsay: bool) -> None:
+    """Later entries would make each fit as long as the path that they tell: a kB has hundreds of ticks."""
+    team = load("relative").config("a").team
+    assert team is not None
+    log = TeamLog.of(team, hearsay=hearsay)
+    for tick in range(4):
+        log = log.measured(0, Observation(tick, "a", REST if tick else None, None), team)
+    many = tuple([Entry(REST if tick else None) for tick in range(500)])
+    for since in (0, 2, 4):
+        log = log.received([TeamReport(1, (LogPart(1, since, many[since:]),), (0, 0, 0), (0, 1))], 0)
+        assert log.logs[1] == many[:4]
+    assert log.done == {1}
+    assert log.report(0, 2).done == (1,)
 
 
 def state_after(ticks: int) -> tuple[TeamState, Observation]:

@@ -110,17 +110,20 @@ class TeamLog(msgspec.Struct, frozen=True):
         return replace(self, logs=_replaced(self.logs, own, (*self.logs[own], entry)))
 
     def received(self, reports: Sequence[TeamReport], own: int) -> TeamLog:
-        """Return the logs with what is new in `reports`, of robots other than the one at the place `own`."""
+        """Return the logs with what is new in `reports`, of robots other than the one at the place `own`.
+
+        Nobody else knows its result, and no entry is of a later tick than its latest one.
+        """
         logs, acknowledged, done = self.logs, self.acknowledged, self.done
         count = len(logs)
         for report in reports:
             if report.sender >= count or len(report.known) != count or report.sender == own:
                 continue  # of no robot of this team
             told = [one for one in range(count) if one != own and (self.hearsay or one == report.sender)]
-            done = done.union([one for one in report.done if one in (*told, own)])
+            done = done.union([one for one in report.done if one in told])
             for part in report.parts:
                 if part.robot in told and part.since <= len(logs[part.robot]):
-                    new = part.entries[len(logs[part.robot]) - part.since :]
+                    new = part.entries[len(logs[part.robot]) - part.since : len(logs[own]) - part.since]
                     logs = _replaced(logs, part.robot, (*logs[part.robot], *new)) if new else logs
             known = tuple(map(max, acknowledged[report.sender], report.known))
             acknowledged = _replaced(acknowledged, report.sender, known)
