@@ -15,7 +15,7 @@ from mcap.writer import Writer
 from msgspec.structs import asdict, replace
 
 from agent.estimation.following import ClaimRule
-from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR, BadRecording
+from compose.errors import BROKEN_PIPE, STOPPED_STATUS, USER_ERROR, UserError
 from compose.recording.estimating import estimate_run
 from compose.recording.estimating.estimate_rows import PoseEstimateRow, estimate_csv
 from compose.recording.estimating.estimate_run import StreamEstimate, estimated
@@ -178,8 +178,8 @@ def test_a_robot_that_joins_a_stream_begins_the_estimate_again(messages: Message
         assert times[-1] > end - 0.6
 
 
-@pytest.mark.parametrize("first_end", [3.0, 12.0])
-def test_a_robot_whose_first_increment_ends_late_joins_a_stream_within_10_s(first_end: float) -> None:
+@pytest.mark.parametrize("first_end", [3.0, LONG_GAP_S + 12.0])
+def test_a_robot_that_is_known_before_its_odometry_joins_a_stream(first_end: float) -> None:
     tables = circling(first_end + 2.0)
     rows: list[tuple[float, AnyRow]] = [(0.0, AntennaRow("late", 0.0, 0.0, 0.0))]
     rows += [(0.0, AnchorRow(**one)) for one in tables["anchors"]]  # type: ignore[arg-type]
@@ -192,15 +192,61 @@ def test_a_robot_whose_first_increment_ends_late_joins_a_stream_within_10_s(firs
         rows.append((increment.t1, increment))
         if increment.t0 >= first_end:
             rows.append((increment.t1, replace(increment, robot="late")))
-    rows.append((first_end, OdometryRow("late", 0.0, first_end, 0.5, 0.0, 0.25 * first_end)))
+    rows.append((first_end, OdometryRow("late", first_end - 3.0, first_end, 0.5, 0.0, 0.75)))
     rows.sort(key=lambda one: (one[0], isinstance(one[1], OdometryRow)))
-    estimate = StreamEstimate("it", None, told_noise(PROFILE), ClaimRule())
+    told: list[str] = []
+    estimate = StreamEstimate("it", None, told_noise(PROFILE), ClaimRule(), told.append)
     arriving = ((row, SourcePlace("it", i)) for i, (_, row) in enumerate(rows))
-    if first_end > LONG_GAP_S:
-        with pytest.raises(BadRecording, match="late has no odometry"):
-            list(estimate.rows(arriving))
-    else:
-        assert {row.robot for row in estimate.rows(arriving) if row.t_s > first_end} == {"r", "late"}
+    assert {row.robot for row in estimate.rows(arriving) if row.t_s > first_end} == {"r", "late"}
+    awaited = [one for one in told if "has no odometry" in one]
+    assert awaited == ["it, line 0: robot: late has no odometry"] * (first_end > LONG_GAP_S)
+
+
+def test_a_stream_tells_what_is_missing_for_an_estimate(messages: Messages) -> None:
+    def told(some: Messages, robots: tuple[str, ...] | None = None) -> list[str]:
+        said: list[str] = []
+        estimate = StreamEstimate("it", robots, told_noise(PROFILE), ClaimRule(), said.append)
+        list(estimate.rows(rows_as_they_arrive(io.BytesIO(written(some)), "it")))
+        with suppress(UserError):
+            estimate.result()
+            return said
+        with pytest.raises(UserError) as ended:
+            estimate.result()
+        return [*said, str(ended.value)]
+
+    def without(topic: str, of: str = "robot") -> Messages:
+        return [one for one in messages if not (one[1] == topic and of in one[2] and one[0] > 6.0)]
+
+    end = max(t for t, topic, row in messages if topic == "/odometry" and t <= 6.0 and row["robot"] == "B")
+    late = [one for one in messages if one[2].get("robot") != "B" or one[0] <= 6.0]
+    assert told(late) == [f"it: there is no odometry of B after {end:.15g} s. Nothing is estimated."]
+    assert told(messages, ("A", "C"))[-1] == "it: there is no odometry of C"
+    nobody = "it: two robots need ranges to two anchors at different places"
+    lacking = told([one for one in messages if one[1] != "/ranges"])
+    assert [one.startswith(nobody) for one in lacking] == [True, True]
+    unknown = told([one for one in messages if one[1] != "/anchors"])
+    strange = [one for one in unknown if not one.startswith(nobody)]
+    assert (len(strange), len(unknown)) == (2, 4)
+    assert all("is neither a robot with odometry nor a known anchor" in one for one in strange)
+
+
+def test_a_pause_of_a_stream_is_no_part_of_what_is_kept(
+    messages: Messages, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(estimate_run, "MOST_S", 24.0)
+    monkeypatch.setattr(estimate_run, "KEPT_S", 20.0)
+    stamps = ("t", "t0", "t1")
+    paused = [
+        (t, topic, {name: x + 30.0 * (t > 20.0) if name in stamps else x for name, x in row.items()})  # type: ignore[operator]
+        for t, topic, row in messages
+    ]
+
+    told: list[str] = []
+    estimate = StreamEstimate("it", None, told_noise(PROFILE), ClaimRule(), told.append)
+    rows = list(estimate.rows(rows_as_they_arrive(io.BytesIO(written(paused)), "it")))
+    assert estimate.result()[0].t0 < 20.0
+    assert [one.claim for one in rows[-2:]] == [True, True]
+    assert told == []
 
 
 def test_poses_in_a_stream_are_its_odometry(messages: Messages) -> None:
@@ -332,6 +378,7 @@ def test_the_estimates_before_a_wrong_row_of_a_stream_are_written(tmp_path: Path
             ("bad.mcap", "--follow", "--window", "1..2"),
             "--follow: a stream has its own anchors, and no window",
         ),
+        (("-",), "-: standard input is read with --follow only"),
         (("bad.mcap", "--follow", "--relative", "A"), "--relative: with --follow, --robots has to name"),
     ],
 )
@@ -345,3 +392,12 @@ def test_a_wrong_stream_is_one_line(words: tuple[str, ...], says: str, tmp_path:
     assert ended.err.count("\n") == 1
     assert says in ended.err
     assert ended.out == "", "no heading"
+
+
+def test_a_closed_standard_input_is_an_empty_stream() -> None:
+    command = f"exec '{sys.executable}' -m tandem estimate - --follow <&-"
+    ended = subprocess.run(
+        ["/bin/sh", "-c", command], cwd=HOUSE, capture_output=True, text=True, timeout=BOUND_S, check=False
+    )
+    empty = "tandem estimate: standard input: there is no second with odometry of all robots\n"
+    assert (ended.returncode, ended.stderr) == (USER_ERROR, empty)

@@ -527,7 +527,7 @@ def test_poses_hours_apart_are_a_jump_and_poses_among_increments_are_named(tmp_p
     (a,) = read_ranges(written_csv(tmp_path, tables)).robots
     assert [one.why for one in a.jumps] == [
         f"{tmp_path}/poses.csv, line 3: t: it lasts 4000 s, and an estimate bridges at most 3600 s; "
-        "was a clock set? --window chooses a part"
+        "was a clock set? --window chooses a part of a file"
     ]
     (tmp_path / "poses.csv").rename(tmp_path / "odometry.csv")
     assert refused(tmp_path).endswith("sigma_dheading; poses are in poses.csv")

@@ -6,7 +6,6 @@ import argparse
 import math
 import sys
 from collections.abc import Iterator
-from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -45,6 +44,8 @@ def main(options: argparse.Namespace) -> int:
     if options.follow:
         problem, estimate, stopped = _followed(options, rule, solver)
     else:
+        if str(options.recording) == "-":
+            raise UserError("-: standard input is read with --follow only")
         recording = read_ranges(options.recording, options.anchors)
         unread = ", ".join([f"{what}: {count}" for what, count in recording.unused.items()])
         problem = measurements(
@@ -81,9 +82,7 @@ def _followed(
         )
     name = "standard input" if str(options.recording) == "-" else str(options.recording)
     noise = told_noise(options.noise) if options.noise is not None else None
-    estimate = StreamEstimate(
-        *(name, options.robots, noise, rule, partial(_doubted, name), solver, options.relative)
-    )
+    estimate = StreamEstimate(*(name, options.robots, noise, rule, _tell, solver, options.relative))
     try:
         stream = sys.stdin.buffer if str(options.recording) == "-" else options.recording.open("rb")
     except OSError as error:
@@ -109,8 +108,8 @@ def _followed(
     return *estimate.result(), None
 
 
-def _doubted(name: str, doubt: str) -> None:
-    say(f"tandem estimate: {name}: {doubt} Nothing is estimated.", error=True)
+def _tell(what: str) -> None:
+    say(f"tandem estimate: {what}", error=True)
 
 
 def _written(out: Path, problem: Measurements, estimate: RecordingEstimate) -> list[Path]:

@@ -73,6 +73,7 @@ class _Version(argparse.Action):
 
 def main(arguments: Sequence[str] | None = None) -> NoReturn:
     """Run the command in `arguments`, or in sys.argv, and end the process with its exit status."""
+    sys.stdin = sys.stdin or open(os.devnull)  # noqa: SIM115
     sys.stdout = sys.stdout or open(os.devnull, "w")  # noqa: SIM115  # the launching process has closed it
     sys.stderr = sys.stderr or open(os.devnull, "w")  # noqa: SIM115
     name = "tandem"

@@ -83,7 +83,8 @@ class RecordingBuilder:
         self._antennas: dict[str, AntennaRow] = {}
         self._ranges: list[tuple[RangeRow, object]] = []
         self._last_range: dict[frozenset[str], float] = {}
-        self._claims: list[tuple[str, object]] = []
+        self._claims: dict[str, object] = {}
+        """The robots that antennas and true poses name, with the first place of each."""
 
     @property
     def spans(self) -> dict[str, tuple[float, float]]:
@@ -111,11 +112,11 @@ class RecordingBuilder:
             case AntennaRow():
                 if self._antennas.setdefault(row.robot, row) != row:
                     raise BadRecording(f"{place}: there are two antennas of {row.robot}")
-                self._claims.append((row.robot, place))
+                self._claims.setdefault(row.robot, place)
             case TruePoseRow():
                 path = self._truth.setdefault(row.robot, [])
                 path.append(_after(path[-1] if path else None, row, "true pose", place))
-                self._claims.append((row.robot, place))
+                self._claims.setdefault(row.robot, place)
             case PoseRow():
                 self._add_pose(row, place)
 
@@ -192,9 +193,8 @@ class RecordingBuilder:
         if late > LONGEST_GAP_S:
             what = f"t0: it starts {late:.6g} s after the end of the increment of {row.robot} before it"
             begin, end = before, row.t0
-        what += (
-            f", and an estimate bridges at most {LONGEST_GAP_S:g} s; was a clock set? --window chooses a part"
-        )
+        limit = f"an estimate bridges at most {LONGEST_GAP_S:g} s"
+        what += f", and {limit}; was a clock set? --window chooses a part of a file"
         self._jumps.setdefault(row.robot, []).append(Jump(begin, end, f"{place}: {what}"))
 
     def _add_range(self, row: RangeRow, place: object) -> None:
@@ -208,20 +208,17 @@ class RecordingBuilder:
         self._last_range[pair] = row.t
         self._ranges.append((row, place))
 
-    def recording(self, through_s: float = math.inf) -> RangeRecording:
+    def recording(self, *, whole: bool = True) -> RangeRecording:
         """Return the recording. Raises BadRecording if a name is unknown, or if there is no odometry.
 
-        Ranges after `through_s` that name a robot without odometry are left out: its first increment may come
-        later. If no odometry begins by `through_s`, other rows may name such a robot, too.
+        If it is not `whole`, rows with unknown names are left out: what makes them known may come later.
         """
         if not self._odometry:
             there = ", ".join([f"{what}: {count}" for what, count in self.unused.items()])
             hint = f", but {there}; a .toml file maps topics of ROS" if there else ""
             raise BadRecording(f"{self.source}: there is no odometry{hint}")
-        begun = any(begin <= through_s for begin, _ in self.spans.values())
-        for robot, place in self._claims if begun or through_s == math.inf else ():
-            if robot not in self._odometry:
-                raise BadRecording(f"{place}: robot: {robot} has no odometry")
+        for why in self.unknown().values() if whole else ():
+            raise BadRecording(why)
         anchors = self._anchors | self._given
         for anchor in anchors:
             if anchor in self._odometry:
@@ -230,7 +227,7 @@ class RecordingBuilder:
             self.source,
             tuple(map(self._robot, self._odometry)),
             tuple([one.fixed for one in anchors.values()]),
-            self._range_series([*self._odometry, *anchors], through_s),
+            self._range_series([*self._odometry, *anchors]),
             dict(self.unused),
         )
         self._check_times(recording)
@@ -279,30 +276,35 @@ class RecordingBuilder:
             tuple(self._jumps.get(name, ())),
         )
 
-    def _unknown(self, name: str, names: Sequence[str]) -> str:
-        """Return that no robot or anchor has this `name`, and the `names` that there are, robots first."""
-        robots, anchors = [
-            listed(some) for some in (names[: len(self._odometry)], names[len(self._odometry) :])
-        ]
-        advice = did_you_mean(name, names) or "; --anchors FILE adds some, without x and y if unknown"
-        there = f"robots: {robots}; anchors: {anchors or 'none'}{advice}"
-        return f"is neither a robot with odometry nor a known anchor; {there}"
+    def unknown(self, before_s: float = math.inf) -> dict[str, str]:
+        """Return the place of each unknown name, and what is wrong there.
 
-    def _range_series(self, names: Sequence[str], through_s: float) -> RangeSeries:
+        Ranges after `before_s` are not looked at.
+        """
+        robots, anchors = self._odometry, self._anchors | self._given
+        found = {
+            robot: f"{place}: robot: {robot} has no odometry"
+            for robot, place in self._claims.items()
+            if robot not in robots
+        }
+        there = f"robots: {listed([*robots])}; anchors: {listed([*anchors]) or 'none'}"
+        for row, place in self._ranges:
+            for name in (row.first, row.second):
+                if name in robots or name in anchors or name in found or row.t >= before_s:
+                    continue
+                advice = did_you_mean(name, [*robots, *anchors])
+                advice = advice or "; --anchors FILE adds some, without x and y if unknown, to a file"
+                found[name] = (
+                    f"{place}: {name} is neither a robot with odometry nor a known anchor; {there}{advice}"
+                )
+        return found
+
+    def _range_series(self, names: Sequence[str]) -> RangeSeries:
         radios = {name: i for i, name in enumerate(names)}
         robots = len(self._odometry)
-        used = [
-            (row, place)
-            for row, place in self._ranges
-            if row.t <= through_s or (row.first in radios and row.second in radios)
-        ]
-        ends = np.array([(radios.get(row.first, -1), radios.get(row.second, -1)) for row, _ in used], np.intp)
-        ends = ends.reshape(-1, 2)
-        wrong = np.flatnonzero((ends.min(axis=1) < 0) | (ends.min(axis=1) >= robots))
-        for row, place in [used[i] for i in wrong[:1]]:
-            for name in (row.first, row.second):
-                if name not in radios:
-                    raise BadRecording(f"{place}: {name} {self._unknown(name, names)}")
+        used = [(row, place) for row, place in self._ranges if row.first in radios and row.second in radios]
+        ends = np.array([(radios[row.first], radios[row.second]) for row, _ in used], np.intp).reshape(-1, 2)
+        for row, place in [used[i] for i in np.flatnonzero(ends.min(axis=1) >= robots)[:1]]:
             raise BadRecording(f"{place}: {row.first} and {row.second} are both anchors")
         ends = np.where(ends[:, :1] >= robots, ends[:, ::-1], ends)
         lengths = [(row.t, row.range, np.nan if row.sigma is None else row.sigma) for row, _ in used]
