@@ -38,7 +38,7 @@ export function shown(view, robot, tints) {
     return { all, measured };
   }
   if (!now) return { all: [], measured };
-  const robots = pair.map((id) => store.stage.robots.find((one) => one.id === id));
+  const robots = pair.map((id) => store.stage.robots[store.places.get(id)]);
   const [a, b] = robots.map((one) => held_now({ ...view, scene, truth: true }, one).poses);
   return { all: a.map((pose, i) => ({ tint: left[i], a: pose, b: b[i], predicted: distance(pose, b[i]), out: false })), measured };
 }
@@ -120,8 +120,8 @@ export class Configurations {
    */
   manoeuvre(view, robot) {
     const { store, tick, truth, focus, eliminated } = view, at = eliminated < 1 ? tick - 1 : tick;
-    const found = joined(store.scene(at), robot.id)?.manoeuvre, { all } = shown(view, robot, this.plane.tints);
-    if (!found || !view.planned || all.length < 2 || (focus && !truth)) return;
+    const found = joined(store.scene(at), robot.id)?.manoeuvre;
+    if (!found || !view.planned || (focus && !truth) || shown(view, robot, this.plane.tints).all.length < 2) return;
     for (const mark of ["reachable", "choice"]) this.plane.marks.add(mark);
     const player = store.player(at, found.robot), poses = poses_of(store, at, [robot.id, robot.peer]).slice(0, MOST);
     const starts = truth && player.pose ? [player.pose] : poses.map(([a, b]) => (found.robot === robot.id ? a : b));

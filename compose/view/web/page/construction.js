@@ -41,8 +41,9 @@ export function mirrored(store, tick, robot, truth) {
  * one that stands relative to it, both anchors and the turns about the driver's anchor that fit; null in other ticks.
  */
 export function crossing(store, tick, robot) {
-  const pair = [robot.id, robot.peer], robots = pair.map((id) => store.stage.robots.find((one) => one.id === id));
-  if (robots.some((one) => !one?.anchor) || !joined(store.scene(tick), robot.id) || joined(store.scene(tick - 1), robot.id)) return null;
+  if (!joined(store.scene(tick), robot.id) || joined(store.scene(tick - 1), robot.id)) return null;
+  const pair = [robot.id, robot.peer], robots = pair.map((id) => store.stage.robots[store.places.get(id)]);
+  if (robots.some((one) => !one?.anchor)) return null;
   const [now, before] = [tick, tick - 1].map((k) => store.player(k, robot.id)?.contacts?.[0]?.[1]);
   const driven = pair.map((id) => store.player(tick, id)?.executed ?? [0, 0]), mover = driven.findIndex(([v]) => v !== 0);
   const all = poses_of(store, tick, pair), held = store.player(tick, robot.id)?.held;

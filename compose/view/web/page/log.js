@@ -59,11 +59,11 @@ export class Log {
     let now = wanted.findIndex((event) => event.tick >= tick);
     if (now < 0) now = wanted.length;
     const from = Math.max(0, now - NEAR), shown = wanted.slice(from, now + NEAR);
-    const key = `${from}/${focus}/${truth}/${shown.map((event) => event.tick + event.text).join("/")}`;
-    if (key !== this.key) {
-      this.key = key;
-      this.root.replaceChildren(...shown.map((event) => this.#item(event, truth)));
-    }
+    if (truth !== this.truth) this.#items = new WeakMap();
+    const items = new Set(shown.map((event) => this.#item(event, truth)));
+    for (const item of [...this.root.children]) if (!items.has(item)) item.remove();
+    let after = this.root.firstChild; // only what has come into the list is laid out again
+    for (const item of items) if (item === after) after = after.nextSibling; else this.root.insertBefore(item, after);
     let current = null;
     for (const item of this.root.children) {
       const there = Number(item.dataset.tick);
@@ -81,7 +81,11 @@ export class Log {
     this.truth = truth;
   }
 
+  #items = new WeakMap();
+
+  /** Returns the line of an event; the same one at each call. */
   #item(event, truth) {
+    if (this.#items.has(event)) return this.#items.get(event);
     const sign = make("span", { className: "sign", textContent: SIGNS[event.kind] });
     sign.setAttribute("aria-hidden", "true");
     const go = make("button", { type: "button" }, make("b", { textContent: event.tick }), sign, make("span", { textContent: said(event, truth) }));
@@ -89,6 +93,7 @@ export class Log {
     const item = make("li", {}, go);
     item.dataset.tick = event.tick;
     item.dataset.kind = event.kind;
+    this.#items.set(event, item);
     return item;
   }
 }

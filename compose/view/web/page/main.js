@@ -303,11 +303,13 @@ function draw() {
     view.told = guide.told(view);
     const turned = guide.turned(view);
     view.turned = turned !== null && still.matches ? 1 : turned;
-    // First the texts: they decide the size of the plane, and its camera and its labels keep clear of them.
+    // First the texts: they decide the size of the plane, its camera and its labels keep clear of them, and there is one layout.
     controls();
     $("caption").classList.toggle("several", view.told.length > 1);
     text($("caption"), view.told.map((one) => said(one, view.truth, " ")).join(" "));
     predictions.draw(view, store, guide.pair(view.focus));
+    cards.draw(view);
+    log.draw(view);
     if (plane.following) plane.follow(view, store, guide.pair(view.focus), (view.playing || plane.easing) && !still.matches ? now : null);
     attribute(document.body, "data-tick", String(view.tick));
     attribute(document.body, "data-shown", store.scene(view.tick) ? String(view.tick) : "");
@@ -315,8 +317,6 @@ function draw() {
     plane.draw(store, view);
     const size = [$("canvas").clientWidth, $("canvas").clientHeight];
     tip.draw({ ...view, store }, plane.hovered ?? plane.targets.find((one) => same(one, view.selected)), size, plane.unit);
-    cards.draw(view);
-    log.draw(view);
     timeline.draw(view, activities(store, view));
     legend.draw(store.grouped ? group_marks(plane.marks, store.stage.team) : plane.marks, timeline.kinds, legend_names());
     sequence.draw(store, view);

@@ -13,7 +13,7 @@ import { palette } from "./strip.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
-import { kinds_of, LEAST_GAP_M, pose_now, REPORTED, Trails, TRUE } from "./trails.js";
+import { LEAST_GAP_M, pose_now, REPORTED, Trails, TRUE } from "./trails.js";
 import { metres } from "./words.js";
 
 /** The time in s in which the camera covers most of the way to where it is needed. */
@@ -225,9 +225,20 @@ export class Plane {
 
   /** Returns whether the box with the corners `least` and `most`, in m, is in view. */
   sees(least, most) {
-    const [low, high] = [[0, this.height], [this.width, 0]].map((corner) => this.world(corner));
-    return least.every((one, i) => one <= high[i]) && most.every((one, i) => one >= low[i]);
+    const [x, y] = this.centre, wide = this.width / 2 / this.scale, tall = this.height / 2 / this.scale;
+    return least[0] <= x + wide && most[0] >= x - wide && least[1] <= y + tall && most[1] >= y - tall;
   }
+
+  /** Calls `draw` while the plane is larger by `pad` pixels on each side. */
+  padded(pad, draw) {
+    const size = this.#size;
+    this.#size = size.map((one) => one + 2 * pad);
+    draw();
+    this.#size = size;
+  }
+
+  /** The parts of a metre that are at most a pixel long: a power of two. */
+  get fine() { return 2 ** Math.ceil(Math.log2(this.scale)); }
 
   draw(store, { tick, share, focus, truth, moving, eliminated, planned, turned, selected }) {
     this.#measure();
@@ -255,11 +266,9 @@ export class Plane {
     const shown = (robot) => truth || !focus || robot.id === focus;
     const all = store.stage.robots.filter(shown), robots = view.scene && all.length > ALL_DRAWN ? this.#in_view(view, all) : all;
     this.#backdrop.draw(view, all, robots, ratio);
-    for (const robot of store.stage.mission.sensing_range * this.scale < VISIBLE_PX ? [] : robots) {
-      if (!truth) this.#trails.believed_trail(view, robot);
-      else for (const kind of kinds_of(robot)) this.#trails.newest(pen, view, robot, kind);
-      if (truth) this.#trails.turned(pen, view, robot);
-    }
+    const near = store.stage.mission.sensing_range * this.scale < VISIBLE_PX ? [] : robots;
+    if (truth) this.#trails.newest(pen, view, near);
+    for (const robot of near) this.#trails[truth ? "turned" : "believed_trail"](pen, view, robot);
     if (view.scene) this.#scene(view, robots);
     else this.#backdrop.beacons(view, robots);
     this.#ring(this.targets.find((one) => same(one, selected)), look);

@@ -6,7 +6,12 @@ const NEAR = 0.2; // of the sensing range, from where a configuration was driven
 const MOST_TICKS = 400;
 
 /** The configurations of a pair in a scene, if its robots hold the same ones. */
-export const joined = (scene, robot) => scene?.configurations?.find(({ robots }) => robots.includes(robot));
+export function joined(scene, robot) {
+  if (!scene?.configurations) return undefined;
+  if (!pairs.has(scene)) pairs.set(scene, new Map(scene.configurations.toReversed().flatMap((one) => one.robots.map((id) => [id, one]))));
+  return pairs.get(scene).get(robot);
+}
+const pairs = new WeakMap();
 
 export class Tints {
   #known = new Map();

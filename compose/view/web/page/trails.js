@@ -35,7 +35,7 @@ export function pose_now({ store, tick, share, moving }, robot, kind) {
 }
 
 /** Returns the trails of a robot that are known with the truth. */
-export const kinds_of = (robot) => (robot.attack ? [TRUE, REPORTED] : [TRUE]);
+const kinds_of = (robot) => (robot.attack ? [TRUE, REPORTED] : [TRUE]);
 
 export class Trails {
   constructor(plane) { this.plane = plane; }
@@ -45,20 +45,28 @@ export class Trails {
   /** Discards the cached paths, because the scenes have changed. */
   forget() { this.#chunks.clear(); }
 
-  /** Draws the trails of `robots` up to the tick, as far as they are in view: all pieces of one style at once. */
-  trails(pen, view, robots) {
-    const { store, tick, focus } = view, { plane } = this, last = Math.min(tick, store.last), styles = new Map();
+  /** Returns the trails of `robots` up to the tick as { robot, kind, strength, phase, role, pieces }: all pieces of one style together. */
+  styles({ store, tick, focus }, robots) {
+    const last = Math.min(tick, store.last), styles = new Map();
     for (const robot of robots) for (const kind of kinds_of(robot)) for (let from = store.first, to; from < last; from = to) {
       const long = from + CHUNK <= last - OLD && (from - store.first) % CHUNK === 0, end = from + (long ? CHUNK : STEP);
       const strength = PAST + (1 - PAST) * Math.max(0, 1 - Math.max(0, last - end) / OLD);
       to = Math.min(end, last);
-      for (const { path, least, most, phase, role } of this.#pieces(store, robot, kind, from, to)) {
-        const key = `${kind.name}/${phase}/${role}/${strength}/${focus && robot.id !== focus}`;
-        if (!styles.has(key)) styles.set(key, { robot, kind, strength, piece: { path: new Path2D(), phase, role } });
-        if (plane.sees(least, most)) styles.get(key).piece.path.addPath(path);
+      for (const piece of this.#pieces(store, robot, kind, from, to)) {
+        const { phase, role } = piece, key = `${kind.name}/${phase}/${role}/${strength}/${focus && robot.id !== focus}`;
+        if (!styles.has(key)) styles.set(key, { robot, kind, strength, phase, role, pieces: [] });
+        styles.get(key).pieces.push(piece);
       }
     }
-    for (const { robot, kind, strength, piece } of styles.values()) this.#stroked(pen, view, robot, kind, (stroke) => stroke(piece, strength));
+    return [...styles.values()];
+  }
+
+  /** Draws the trails of `styles`, as far as they are in view: many short paths are drawn in less time than a long one. */
+  trails(pen, view, styles) {
+    for (const { robot, kind, strength, phase, role, pieces } of styles) {
+      const paths = pieces.filter(({ least, most }) => this.plane.sees(least, most)).map(({ path }) => path);
+      this.#stroked(pen, view, robot, kind, (stroke) => stroke({ paths, phase, role }, strength));
+    }
   }
 
   /**
@@ -91,20 +99,30 @@ export class Trails {
     pen.globalAlpha = 1;
   }
 
-  /** Draws the part of a trail that `robot` has driven since the tick. */
-  newest(pen, view, robot, kind) {
-    const { store, tick, share, moving } = view;
-    if (!moving || share <= 0) return;
+  /** Draws the parts of trails that `robots` have driven since the tick. */
+  newest(pen, view, robots) {
+    const styles = new Map(), { store, focus } = view;
+    for (const robot of view.moving && view.share > 0 ? robots : []) for (const kind of kinds_of(robot)) {
+      const path = this.#driven(view, robot, kind), phase = store.phase(view.tick, robot.id), { role } = robot;
+      const key = `${kind.name}/${phase}/${role}/${focus && robot.id !== focus}`;
+      if (!styles.has(key)) styles.set(key, { robot, kind, phase, role, paths: [] });
+      if (path) styles.get(key).paths.push(path);
+    }
+    for (const { robot, kind, ...style } of styles.values()) if (style.paths.length) this.#stroked(pen, view, robot, kind, (stroke) => stroke(style));
+  }
+
+  /** Returns the path of `robot` since the tick; undefined if there is none. */
+  #driven({ store, tick, share }, robot, kind) {
     const player = store.player(tick, robot.id), next = store.player(tick + 1, robot.id);
     const start = kind.pose(player), end = kind.pose(next), { period } = store.stage.mission;
-    if (!start || !end || !kind.differs(player, next)) return;
-    const driven = kind.driven(player, next, period), path = new Path2D(), bends = bends_of(driven, period);
+    if (!start || !end || !kind.differs(player, next)) return undefined;
+    const driven = kind.driven(player, next, period), path = new Path2D(), bends = bends_of(driven, period, this.plane.fine);
     path.moveTo(start[0], start[1]);
     for (let k = 1; k <= bends; k++) {
       const pose = between(start, end, driven, (share * k) / bends, period);
       path.lineTo(pose[0], pose[1]);
     }
-    this.#stroked(pen, view, robot, kind, (stroke) => stroke({ path, phase: store.phase(tick, robot.id), role: robot.role }));
+    return path;
   }
 
   /** Calls `draw` with a function that strokes a piece of a trail, whose path is in m, in the style of its phase. */
@@ -114,14 +132,14 @@ export class Trails {
     pen.save();
     pen.globalAlpha = faint ? 0.4 : 0.95;
     pen.setTransform(ratio * s, 0, 0, -ratio * s, ratio * (wide / 2 - centre[0] * s), ratio * (height / 2 + centre[1] * s));
-    draw(({ path, phase, role }, strength = 1) => {
+    draw(({ path, paths = [path], phase, role }, strength = 1) => {
       const hue = kind === REPORTED ? look.fault : look.robot[role];
       pen.strokeStyle = strength < 1 ? look.pale(hue, Math.round(100 * strength)) : hue;
       const { dash, width } = kind === REPORTED ? REPORTED_STYLE : TRAIL[phase] ?? TRAIL[2];
       this.plane.marks.add(kind === REPORTED ? "reported" : `path-${phase}`);
       pen.lineWidth = (faint ? 0.7 * width : width) / s;
       pen.setLineDash(dash.map((length) => length / s));
-      pen.stroke(path);
+      for (const one of paths) pen.stroke(one);
     });
     pen.restore();
   }
@@ -132,7 +150,7 @@ export class Trails {
    * `least` and `most` are the corners of a box around `path`.
    */
   #pieces(store, robot, kind, from, to) {
-    const key = `${kind.name}/${robot.id}/${from}/${to - from}`, cached = this.#chunks.get(key);
+    const { fine } = this.plane, key = `${kind.name}/${robot.id}/${from}/${to - from}/${fine}`, cached = this.#chunks.get(key);
     if (cached) return cached;
     const pieces = [], period = store.stage.mission.period;
     let path = null, phase = null, role = null, complete = true;
@@ -158,7 +176,7 @@ export class Trails {
         phase = now;
         role = hue;
       }
-      const driven = kind.driven(here, next, period), bends = bends_of(driven, period);
+      const driven = kind.driven(here, next, period), bends = bends_of(driven, period, fine);
       for (let bend = 1; bend < bends; bend++) to_pose(between(start, end, driven, bend / bends, period));
       to_pose(end);
     }
@@ -167,7 +185,7 @@ export class Trails {
   }
 
   /** Draws the trail implied by the most probable current pose, or one per pose if none leads. */
-  believed_trail(view, robot) {
+  believed_trail(_pen, view, robot) {
     const { store, tick, share, moving } = view, now = store.player(tick, robot.id)?.held;
     if (!now?.local.length) return;
     const here = held_now({ ...view, moving: false }, robot).poses, there = held_now(view, robot).poses;
@@ -218,7 +236,8 @@ export class Trails {
   }
 }
 
-function bends_of(driven, period) {
+/** Returns the number of straight parts with which an arc is drawn: with `fine` parts in a metre at most. */
+function bends_of(driven, period, fine = Infinity) {
   if (!driven) return 1;
-  return Math.max(1, Math.min(4 * BENDS, Math.ceil(Math.abs(driven[1] * period) * 4 * BENDS)));
+  return Math.max(1, Math.min(4 * BENDS, Math.ceil(Math.abs(driven[0] * period) * fine), Math.ceil(Math.abs(driven[1] * period) * 4 * BENDS)));
 }
