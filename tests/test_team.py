@@ -175,6 +175,7 @@ def test_a_claim_says_across_which_line_of_anchors_no_range_tells_where_they_sta
     (tmp_path / "line.toml").write_text(f'name = "line"\nseed = 1\n{EXACT}{IN_A_LINE}{ALONE}')
     said = tandem_command("run", tmp_path / "line.toml", "--in-process")
     assert "no range tells whether A1, A2 stand off by the accuracy of a claim" in said.out
+    assert "summary.json of --out" in " ".join(said.out.split())
 
 
 def to_a_sigma(sigma: float, scenario: Scenario) -> Scenario:

@@ -89,7 +89,8 @@ def unverified(anchors: Sequence[str], file: str) -> str:
     """
     named = listed(anchors, MOST_NAMED_ROBOTS, "more anchors")
     stand = "stand" if len(anchors) > 1 else "stands"
-    return f"no range tells whether {named} {stand} off by the accuracy of a claim; {file} has the directions"
+    what = f"no range tells whether {named} {stand} off by the accuracy of a claim"
+    return f"{what}; {file} of --out has the directions"
 
 
 def _missed(late: Mapping[str, int], ticks: int, rate: float | None) -> str:
