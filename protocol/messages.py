@@ -741,6 +741,12 @@ class Estimate(Message, frozen=True):
     anchors: Annotated[tuple[SurveyedAnchor, ...], Meta(max_length=MAX_MEMBERS)] = ()
     """The anchors of a team that are not surveyed, as far as they are located."""
 
+    def __post_init__(self) -> None:
+        """Raise ValueError if there are probabilities, and not one for each pose; a frame is refused then."""
+        poses, probabilities = len(self.world or self.local), len(self.probabilities)
+        if probabilities not in (0, poses):
+            raise ValueError(f"probabilities: {probabilities} of {poses} poses")
+
 
 class FinalReport(Message, frozen=True):
     """The statistics of a robot about its mission, in answer to MissionEnd.

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from msgspec.structs import replace
 
 from compose.launch import in_process
 from compose.recording.run import Run, read
@@ -15,7 +16,8 @@ from compose.scenario.scenario_change import RobotChange, changed, values_of
 from compose.view.drawing import DARK, GREY, drawing, standing
 from compose.view.numbers import Numbers
 from compose.view.recorded import run_data, scenes
-from compose.view.scene import Scene
+from compose.view.scene import HeldPoses, Scene
+from protocol.motion import ORIGIN
 from tests.browser import Open, shot, until_shown, watching
 from tests.commands import tandem
 
@@ -139,6 +141,17 @@ def test_the_charted_range_of_a_team_is_that_to_the_nearest_anchor(survey: Path)
                 assert numbers.anchor_residual_m is msgspec.UNSET  # no robot knows where it is
     assert several
     assert residuals
+
+
+def test_poses_in_a_frame_that_is_nowhere_in_the_world_are_not_drawn(survey: Path) -> None:
+    """A robot of a team has no frame of an anchor, whatever its Estimates say."""
+    run = read(survey)
+    assert run.setup is not None
+    scene = next(one for one in seen(run) if one.players[0].held is not None)
+    held = HeldPoses(local=(ORIGIN,), world=(), probability=(), covariance=None, localised=False)
+    players = (replace(scene.players[0], held=held), *scene.players[1:])
+    drawn = {one.topic: one for one in drawing(run.setup, replace(scene, players=players))}
+    assert drawn["/a/belief"].arrows == []
 
 
 def test_exports_draw_anchors_where_they_are_and_a_line_for_each_range(survey: Path) -> None:

@@ -24,6 +24,7 @@ from protocol.messages import (
     MAX_REPORT_RANGES,
     MAX_REPORT_RUNS,
     Command,
+    Estimate,
     FinalReport,
     Member,
     Message,
@@ -235,6 +236,15 @@ def test_an_extra_field_is_refused_wherever_it_stands(message: Message) -> None:
 @pytest.mark.parametrize("robot", ["", "a/b", "a b", "*", "a" * 33, "a\n", "ä", "a\x00", "$"])
 def test_a_robot_that_is_no_single_chunk_of_a_key_is_refused(robot: str) -> None:
     refuses(framed(packed(["deadline-missed", 8, robot])))
+
+
+def test_an_estimate_whose_probabilities_are_not_those_of_its_poses_is_refused() -> None:
+    """Readers of recordings and viewers of live missions count on it."""
+    sound = next(one for one in EXAMPLES if isinstance(one, Estimate) and one.probabilities)
+    local, probabilities = 3, 6
+    assert len(sound.probabilities) == len(sound.local) == 1
+    refuses(framed(packed(changed(plain(sound), (probabilities,), [0.5, 0.5]))))
+    refuses(framed(packed(changed(plain(sound), (local,), []))))
 
 
 def test_too_many_entries_and_too_long_words_are_refused() -> None:

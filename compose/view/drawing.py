@@ -122,7 +122,8 @@ def _robot(robot: RobotSetup, setup: RunSetup, player: Player) -> Iterator[Entit
         body = [Arrow(pose, f"{robot.id}: {player.activity}")]
         yield Entity(f"/{robot.id}/body", robot.id, f"{path}/pose", rgb, body, lines)
     if held is not None:
-        poses = held.world or tuple([compose(anchor_frame(robot), pose) for pose in held.local])
+        local = held.local if robot.frame is not None or robot.given_anchor is not None else ()
+        poses = held.world or tuple([compose(anchor_frame(robot), pose) for pose in local])
         labels = [f"{share:.3g}" if len(poses) > 1 else "" for share in held.shares]
         shades = [max(LEAST_OPACITY, share) for share in held.shares]
         arrows = list(map(Arrow, poses, labels, shades))
