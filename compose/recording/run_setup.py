@@ -207,9 +207,10 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
 
         A robot that is not in the mission, or that meets one which is not, changes nothing.
         """
+        ids = {*self.ids}
         robots = [
             replace(one, peer=meeting.peer, role=meeting.role)
-            if (meeting := meetings.get(one.id)) is not None and meeting.peer in {*self.ids} - {one.id}
+            if (meeting := meetings.get(one.id)) is not None and one.id != meeting.peer in ids
             else one
             for one in self.robots
         ]
