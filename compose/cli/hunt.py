@@ -40,14 +40,16 @@ def main(options: argparse.Namespace) -> int:
             tell(f"{hunt.runs} runs, {len(hunt.seen)} states and transitions, {len(hunt.corpus)} inputs kept")
         return bool(hunt.runs >= options.runs if options.runs else now >= began + 60.0 * options.minutes)
 
-    if not options.quiet:
-        tell(f"{options.scenario}: {len(hunt.seeds)} inputs to begin with; Ctrl-C ends the hunt")
+    found, stopped = None, False
     try:
+        if not options.quiet:
+            tell(f"{options.scenario}: {len(hunt.seeds)} inputs to begin with; Ctrl-C ends the hunt")
         found = hunt.run(is_over)
     except StoppedBySignal:
-        _say_reached(hunt, options.scenario, time.monotonic() - began)
-        return STOPPED_STATUS
+        stopped = True
     _say_reached(hunt, options.scenario, time.monotonic() - began)
+    if stopped:
+        return STOPPED_STATUS
     if found is None:
         tell("no invariant was broken")
         return ENDED
