@@ -262,13 +262,15 @@ class LogPlanner(Planner[RobotState, Report]):
             world = (verdict.pose,)
         else:
             world = tuple([state.world_pose(placement) for placement in posterior.placements])
+        local = tuple(phase1_anchor.local(branches_left, state.odometry))
+        told = tuple([one.probability for one in (posterior.pair if world else own.hypotheses)])
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
-            local=tuple(phase1_anchor.local(branches_left, state.odometry)),
+            local=local,
             world=world,
             localised=isinstance(verdict, Localised),
-            probabilities=tuple([one.probability for one in posterior.pair or own.hypotheses]),
+            probabilities=told if len(told) == len(world or local) else (),  # else of hypotheses left out
             covariance=posterior.covariance,
         )
 
