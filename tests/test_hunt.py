@@ -32,7 +32,7 @@ from compose.scenario.kills import parse as kill
 from compose.scenario.scenario_file import load, scenario_table
 from compose.sweep import spec
 from compose.sweep.cells import cells
-from compose.sweep.hunt import coverage, examination, exploration
+from compose.sweep.hunt import examination, exploration, reached_states
 from compose.sweep.hunt.examination import (
     MOST_TICKS,
     MOST_WITHOUT_END,
@@ -261,7 +261,7 @@ def test_a_mutant_takes_the_place_of_a_function_wherever_it_is_imported(
 
 def test_an_input_reaches_the_same_after_another_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(claim, "Blocked", claim.Blocked)  # it is the one of before after this test
-    coverage.note_conditions()
+    reached_states.note_conditions()
     alone = examined(scenario_table("paper-1"))
     examined(scenario_table("noisy"))
     assert examined(scenario_table("paper-1")) == alone
@@ -378,18 +378,18 @@ def test_every_task_condition_and_kind_of_message_is_reached_in_some_mission(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(claim, "Blocked", claim.Blocked)  # it is the one of before after this test
-    coverage.note_conditions()
+    reached_states.note_conditions()
     seen: set[str] = set()
-    left = coverage.never(seen)
+    left = reached_states.never(seen)
     inputs = [*RARE, *[one for each in zip_longest(*map(hunted, SOURCES)) for one in each if one is not None]]
     for table in inputs:
         scenario, _, _ = scenario_of(table)
         if scenario.max_ticks * len(scenario.robots) <= MOST_TICKS:
             sinks, messages, _ = watched(scenario, seen)
-            seen |= coverage.reached(
+            seen |= reached_states.reached(
                 of_frames({name: one.frames for name, one in sinks.items()}, messages=messages)
             )[0]
-            left = coverage.never(seen)
+            left = reached_states.never(seen)
         if not (left["tasks"] or left["messages"] or {*left["conditions"]} - GUARDS):
             break
     assert (left["tasks"], left["messages"], {*left["conditions"]} - GUARDS) == ([], [], set())

@@ -23,6 +23,7 @@ from agent.estimation.gaussian.claim_agreement import united
 from agent.estimation.gaussian.claim_rivals import Rival, likeliest_rival
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.search import search
+from agent.estimation.judged import MUTUAL_RANGES
 from agent.estimation.posterior import Posterior, carried
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import Entry, LogPart, Ranging, TeamLog, TeamReport
@@ -758,6 +759,16 @@ def test_a_claim_with_fewer_ranges_than_determine_a_pose_is_a_violation() -> Non
     spoilt_run = replace(recorded, agents={"a": replace(agent, steps=tuple(bare))})
     found = [one.what for one in audit_run(spoilt_run).violations if one.rule == "claim"]
     assert any("ranges that determine a pose" in one for one in found)
+
+
+def test_an_exact_team_without_anchors_claims_by_fewer_ranges_without_a_violation() -> None:
+    mission = MISSION.replace("0.05", "0.0").replace("0.1", "0.2")
+    drawn = 'frame = "relative"\narea = [0.0, 0.0, 10.0, 10.0]\n[team]\nrobots = 3\nside = 10.0\n'
+    text = f'name = "relative"\nseed = 2837363329321034163\n{mission}{drawn}'
+    run = of_frames(kept(parse(text, "relative")))
+    first, *_ = [k for k, tick in enumerate(run.ticks) if tick.commands["r1"].verdict is not None]
+    assert 2 * (first + 1) < MUTUAL_RANGES
+    assert audit_run(run).violations == ()
 
 
 def test_a_run_of_a_team_is_a_range_recording_with_its_anchors_by_name() -> None:

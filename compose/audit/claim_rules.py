@@ -7,7 +7,7 @@ from itertools import combinations
 from typing import Any
 
 from agent.estimation.exact_estimator import ELSEWHERE
-from agent.estimation.judged import sufficient_mutual_ranges
+from agent.estimation.judged import EXACT_RANGES, sufficient_mutual_ranges
 from agent.planning.planner import Planner
 from agent.planning.separation import LARGEST_ERROR_SIGMAS
 from agent.process.agent_journal import AgentHistory
@@ -89,7 +89,8 @@ def _redundant(run: Run, placed: RobotSpec, agent: AgentHistory, tick: int) -> V
     """
     planner, mission = planner_of(agent.config), run.scenario.mission
     if agent.config.team is not None:
-        least = sufficient_mutual_ranges(mission.noise)
+        exact = mission.noise.exact and agent.config.team.origin is not None
+        least = EXACT_RANGES if exact else sufficient_mutual_ranges(mission.noise)
         return _too_few(tick, placed, "ranges that determine a pose", _determining(agent, tick), least)
     peers = [agent.config.peer]
     if run.scenario.meetings:

@@ -12,9 +12,9 @@ from compose.errors import ENDED, STOPPED_STATUS, VIOLATED, UserError, writing
 from compose.extras import need
 from compose.launch.signals import StoppedBySignal
 from compose.scenario.scenario_file import setting
-from compose.sweep.hunt.coverage import never
 from compose.sweep.hunt.exploration import FoundBreach, Hunt
 from compose.sweep.hunt.mutation import fault_lines
+from compose.sweep.hunt.reached_states import never
 from compose.terminal.invocation import program
 from compose.terminal.text_width import tell
 from protocol.output import one_line

@@ -16,7 +16,9 @@ from compose.launch import in_process, virtual_hardware, virtual_processes
 from compose.recording.run import Run, of_frames
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
-from compose.sweep.hunt.coverage import (
+from compose.sweep.hunt.invariants import Breach, bounded, breaches, guaranteed
+from compose.sweep.hunt.mutation import Clues
+from compose.sweep.hunt.reached_states import (
     DISTURBED,
     REPEATED_EACH,
     DecisionDiffersError,
@@ -24,8 +26,6 @@ from compose.sweep.hunt.coverage import (
     WatchedPlanner,
     reached,
 )
-from compose.sweep.hunt.invariants import Breach, bounded, breaches, guaranteed
-from compose.sweep.hunt.mutation import Clues
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.clock import ClockError
 from protocol.wire import EncodedMessages

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 from compose.errors import UserError
 from compose.launch.supervisor import ChildFailed
-from compose.sweep.hunt import coverage
+from compose.sweep.hunt import reached_states
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
 from compose.sweep.hunt.mutation import (
@@ -236,4 +236,4 @@ def _begin() -> None:
     """Prepare a worker: the command that started it handles signals."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN if number == signal.SIGINT else signal.SIG_DFL)
-    coverage.note_conditions()
+    reached_states.note_conditions()
