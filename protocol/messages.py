@@ -733,8 +733,8 @@ class Estimate(Message, frozen=True):
     probabilities: tuple[Probability, ...] = ()
     """The probabilities of the poses in `world`, or of those in `local` while `world` is empty.
 
-    They are in the order of the poses, most probable first, and sum to 1. Empty with exact sensors, where
-    all remaining poses are equally probable.
+    They are in the order of the poses, most probable first, and sum to 1. Empty where they are not known, and
+    with exact sensors, where all remaining poses are equally probable.
     """
     covariance: Covariance | None = None
     """The covariance of the error of the first pose in `world`; None with exact sensors."""

@@ -263,14 +263,15 @@ class LogPlanner(Planner[RobotState, Report]):
         else:
             world = tuple([state.world_pose(placement) for placement in posterior.placements])
         local = tuple(phase1_anchor.local(branches_left, state.odometry))
-        told = tuple([one.probability for one in (posterior.pair if world else own.hypotheses)])
+        shares = tuple([one.probability for one in (posterior.pair if world else own.hypotheses)])
         return Estimate(
             tick=state.tick,
             robot=state.config.robot,
             local=local,
             world=world,
             localised=isinstance(verdict, Localised),
-            probabilities=told if len(told) == len(world or local) else (),  # else of hypotheses left out
+            # after an encounter has failed, there are poses of it, and hypotheses about the anchor only
+            probabilities=shares if len(shares) == len(world or local) else (),
             covariance=posterior.covariance,
         )
 
