@@ -272,7 +272,7 @@ def test_the_last_manoeuvre_of_the_paper_planner_maximises_eq_8_at_full_speed(
 def test_the_assured_last_manoeuvre_keeps_as_many_hypotheses_in_range_as_it_can(
     case: tuple[Pose, Pose, list[Placement]],
 ) -> None:
-    """Among manoeuvres with as many hypotheses in range, it is the optimum of eq. (8)."""
+    """The optimum of eq. (8) among manoeuvres with as many hypotheses in range is chosen."""
     b, a, found = case
     rim = SECTION_IV.sensing_range - 1e-6
     plan = last_manoeuvre(Question("b", a, b, tuple(found)), SECTION_IV, Assured.MANOEUVRES)

@@ -415,8 +415,7 @@ class Field:
         if left > MOST_TICKS_AHEAD or not self._source.is_newer(start.robot, start.tick, now):
             return False
         self._source.hear(start.robot, start.tick, now)
-        known = self._next != UNKNOWN
-        before = self._next - (self._tick + 1) * self._tick_s if known else None
+        before = None if self._next == UNKNOWN else self._next - (self._tick + 1) * self._tick_s
         began = self._source.agreed(before, now)
         if began is None and start.tick <= MOST_TICKS_AHEAD and self._alive.issuperset(self._others):
             began = now - start.tick * self._tick_s

@@ -132,9 +132,9 @@ class StreamEstimate:
         """The time in s from which on there is odometry of all robots in the estimate."""
         self._doubt = ""
         self._lacking = ""
-        """What the odometry and ranges so far lack for an estimate."""
+        """The reason why the odometry and ranges so far give no estimate; empty before there is one."""
         self._told: set[str] = set()
-        """What was told to be missing."""
+        """The missing names, robots and reasons that were told, each once."""
         self._told_s: float | None = None
         """The time in s of the odometry when that was last looked for; None without odometry."""
         self._count = 0
