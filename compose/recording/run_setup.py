@@ -210,7 +210,7 @@ class RunSetup(msgspec.Struct, frozen=True, dict=True):
         ids = {*self.ids}
         robots = [
             replace(one, peer=meeting.peer, role=meeting.role)
-            if (meeting := meetings.get(one.id)) is not None and one.id != meeting.peer in ids
+            if (meeting := meetings.get(one.id)) and meeting.peer in ids and meeting.peer != one.id
             else one
             for one in self.robots
         ]
