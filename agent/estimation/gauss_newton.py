@@ -64,6 +64,13 @@ DESCENT = 1e-6
 SETTLED_WEIGHT = 1e-2
 """The change of a weight below which the weights have converged."""
 
+TURNING = 0.5
+"""The factor by which a weight takes less of its changes from each one on that turns, after two steps.
+
+With 1, weights of ranges that are as probably outliers as not go to and fro for ever, and the fit with them.
+The first two steps are long: weights that turn there would keep a part of what they were.
+"""
+
 RIDGE = 1e-12
 """The fraction of the information that is added to its diagonal, and an absolute part of the same size.
 
@@ -222,6 +229,7 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
         weight, _ = weights_by_errors(at.walk.residual.tolist(), [math.sqrt(one) for one in loose], by)
     else:
         weight = weights.tolist()
+    last, share = [0.0] * len(weight), [1.0] * len(weight)
     for number in range(until.steps + 1):
         variance = [one + least for one in weighted_variance(by, weight)]
         taken = _step(of, by, at, variance)
@@ -244,7 +252,13 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
         still = still and (number > 0 or until.decrease < 1.0 or not by.noisy)
         if still and expected < until.shortest and _off_model(after, taken, variance, level) <= 1.0:
             return _ended(of, by, at, after, taken, weight, variance, sound, expected)
-        weight, sound, before = updated, sounder, length
+        for j, new in enumerate(updated):
+            change = new - weight[j]
+            if number > 1 and change * last[j] < 0.0:
+                share[j] *= TURNING
+            last[j] = change
+            weight[j] += share[j] * change
+        sound, before = sounder, length
         of, at = _weighed(told, sound, after)
     raise AssertionError("the last step returns")
 

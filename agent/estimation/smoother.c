@@ -42,6 +42,7 @@ const char *compiler(void)
 #define LARGEST_STEP 0.3
 #define DESCENT 1e-6
 #define SETTLED_WEIGHT 1e-2
+#define TURNING 0.5
 #define RIDGE 1e-12
 #define GRAIN 1e-12
 #define LEAST_VARIANCE 1e-300
@@ -83,7 +84,7 @@ typedef struct {
     double *innovation, *variance, *effects, *gain, *state, *u, *p, *information, *gradient;
     double *misfit, *of_limited, *adjoint, *adjoint_limited, *by_unknowns, *weight, *weighted, *effect;
     double *lower, *whitening, *inner, *vector, *other;
-    double *updated, *errors, *spread, *ratios, *shorter, *sound, *noise;
+    double *updated, *last, *share, *errors, *spread, *ratios, *shorter, *sound, *noise;
 } Work;
 
 /* smoother.Step */
@@ -1105,6 +1106,7 @@ static int converged(
     least = by->noisy ? GRAIN * least : 0.0;
     if (!weighed)
         weights_by_errors(by, of->ranges, to->points->walk.residual, w->spread, w->ratios, to->weights);
+    for (Index j = 0; j < of->ranges; j++) w->last[j] = 0.0, w->share[j] = 1.0;
     for (Index number = 0; number <= until->steps; number++) {
         const Point *here = to->points + at;
         weighted_variance(of, by, to->weights, to->variance);
@@ -1132,7 +1134,12 @@ static int converged(
             ended(of, by, at, after, expected, w, to);
             return 1;
         }
-        memcpy(to->weights, w->updated, sizeof(double) * of->ranges);
+        for (Index j = 0; j < of->ranges; j++) {
+            const double change = w->updated[j] - to->weights[j];
+            if (number > 1 && change * w->last[j] < 0.0) w->share[j] *= TURNING;
+            w->last[j] = change;
+            to->weights[j] += w->share[j] * change;
+        }
         before = length;
         at = after;
         if (!told->strays) continue;
@@ -1213,7 +1220,7 @@ static double *workspace(const Measured *of, Work *to)
     const Index longest = q > of->radios ? q : of->radios, ticks = of->strays * of->robots * of->ticks;
     const Index sizes[] = {
         N, N, N * q, N * s, s, s * q, s * s, q * q, q, N, N, s, s, s * size, s * s, s, size,
-        size * size, size * size, size * size, longest, longest, N, N, N, N, n3, ticks, 2 * ticks};
+        size * size, size * size, size * size, longest, longest, N, N, N, N, N, N, n3, ticks, 2 * ticks};
     const int count = sizeof sizes / sizeof *sizes;
     Index all = 0;
     for (int i = 0; i < count; i++) all += sizes[i];
