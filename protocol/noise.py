@@ -23,7 +23,7 @@ GyroBias = Annotated[float, Meta(ge=0.0, le=1e4)]
 Delay = Annotated[float, Meta(ge=0.0, le=1e4)]
 Correlation = Annotated[float, Meta(ge=1e-6, le=1e6)]
 
-ProfileName = Literal["uwb", "uwb-calibrated", "wheels"]
+ProfileName = Literal["uwb", "uwb-calibrated", "wheels", "camera"]
 """The name of a set of values for `Noise`; see PROFILES."""
 
 
@@ -62,6 +62,7 @@ class Priors(NamedTuple):
     gyro_bias: float
     survey_error: float
     range_delay: float
+    range_depth: float
 
     @property
     def of_odometry(self) -> bool:
@@ -72,7 +73,7 @@ class Priors(NamedTuple):
 SIZES = tuple([name for name in Priors._fields if name != "slow_time"])
 """The fields of Priors, and of Noise, that are sizes of errors: 0 stands for none."""
 
-UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.0, 0.0)
+UNTOLD = Priors(0.02, 0.01, 0.005, 0.0, 2.0, 0.005, 0.003, 0.0, 0.0, 0.0)
 """The priors of whoever tells none, for ranges with a sigma of UNTOLD_SIGMA or more.
 
 They are as wide as costs at most 5 % more ticks if the noise is as told: see docs/assumptions.md.
@@ -130,6 +131,12 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     """The prior of the difference of each anchor from its surveyed position along each axis, in m."""
     range_delay: Delay = 0.0
     """The prior of the delay in s of all ranges: of their stamps after the time of the measurement."""
+    range_depth: Fraction = 0.0
+    """The prior of the share of ranges that is a depth, along the heading of the robot that has measured.
+
+    A camera measures depths: shorter than distances by 1 - cos of the bearing. For recordings only, as they
+    tell which robot has measured.
+    """
     strays: Probability = 1e-3
     """The probability that a range has an error of any size and sign; without noise, there are none."""
     odometry_strays: Probability = 0.0
@@ -139,8 +146,8 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     def exact(self) -> bool:
         """True if there is no noise. Then each range is exact, and no detection means out of range."""
         ranges = self.anchor_sigma or self.mutual_sigma or self.outliers or self.drop_outs
-        told = self.range_bias or self.pair_bias or self.range_scale or self.slow_sigma
-        if ranges or told or self.wheel_scale or self.gyro_bias or self.survey_error or self.range_delay:
+        told = self.range_bias or self.pair_bias or self.range_scale or self.slow_sigma or self.survey_error
+        if ranges or told or self.wheel_scale or self.gyro_bias or self.range_delay or self.range_depth:
             return False
         return self.actuation == VelocityNoise() and not self.wanders
 
@@ -210,6 +217,17 @@ PROFILES: Mapping[ProfileName, Mapping[str, Any]] = {
         "mutual_sigma": 0.05,
         "wheel_scale": 0.02,
         "gyro_bias": 0.005,
+    },
+    "camera": {
+        "anchor_sigma": 0.05,
+        "mutual_sigma": 0.05,
+        "range_bias": 0.1,
+        "range_scale": 0.03,
+        "wheel_scale": 0.02,
+        "gyro_bias": 0.005,
+        "range_delay": 0.1,
+        "range_depth": 0.5,
+        "strays": 0.02,
     },
 }
 """The values of `Noise` for common sensors; docs/assumptions.md has their sources."""

@@ -60,9 +60,9 @@ def anchor_range(robot: str, name: str, tick: int, rho: float, sigma: float) -> 
 
 
 def mutual_range(robot: str, other: str, tick: int, rho: float, sigma: float) -> Fact:
-    """Return the range `rho` (m) between two robots, in either order."""
+    """Return the range `rho` (m) that `robot` has measured to another one."""
     first, second = sorted((robot, other))
-    return Fact(FactKey(first, tick, "mutual range", second), MeasuredRange(rho, sigma))
+    return Fact(FactKey(first, tick, "mutual range", second), MeasuredRange(rho, sigma, robot == second))
 
 
 def manoeuvre(robot: str, tick: int, measured: Manoeuvre) -> Fact:
@@ -112,6 +112,8 @@ class MovingGroup(NamedTuple):
     """The true x and y of each robot at each tick; shape (n, 2, k + 1)."""
     delay: float
     """The delay of all ranges in s."""
+    share: float
+    """The share of all ranges that is a depth along the heading of the robot that has measured."""
 
     @property
     def robots(self) -> list[str]:
@@ -145,6 +147,8 @@ def moving_group(
     centres = draw.uniform(0.0, side, (robots, 2))
     bias, scale = priors.range_bias * draw.normal(), priors.range_scale * draw.normal()
     delay = priors.range_delay * draw.normal() if priors.range_delay else 0.0
+    share = priors.range_depth * draw.normal() if priors.range_depth else 0.0
+    headings = np.empty((robots, ticks + 1))
     late: list[Array] = []
     pair_bias: dict[frozenset[str], float] = {}
     known: list[Fact] = []
@@ -158,7 +162,7 @@ def moving_group(
         c, s = math.cos(starts[i, 2]), math.sin(starts[i, 2])
         paths[i] = starts[i, :2, None] + np.stack((c * path.x - s * path.y, s * path.x + c * path.y))
         ends[i] = *paths[i, :, -1], starts[i, 2] + path.heading[-1]
-        turns = starts[i, 2] + path.heading
+        turns = headings[i] = starts[i, 2] + path.heading
         at = [Pose(x, y, heading) for x, y, heading in zip(*paths[i], turns, strict=True)]
         before = map(step, at, -np.append(0.0, v), -np.append(0.0, omega), [delay] * len(at))
         late.append(np.array([(pose.x, pose.y) for pose in before]).T)
@@ -184,21 +188,26 @@ def moving_group(
         more = draw.uniform(0.5, 1.5) if draw.uniform() < outliers else 0.0
         return max(true * (1.0 + scale) + bias + own + noise.mutual_sigma * draw.normal() + more, 0.0)
 
+    def seen(i: int, tick: int, away: Array) -> float:
+        """Return the distance of what is `away` from robot i, or the depth of it in part."""
+        ahead = float(np.dot(away, (math.cos(headings[i, tick]), math.sin(headings[i, tick]))))
+        return (1.0 - share) * float(np.hypot(*away)) + share * ahead
+
     for i, name in enumerate(names):
         if i in unanchored:
             continue
         known.append(anchor(f"M{name}", *centres[i].tolist()))
         for tick in range(0, ticks + 1, 2):
-            away = float(np.hypot(*(late[i][:, tick] - centres[i])))
-            known.append(
-                anchor_range(name, f"M{name}", tick, measured((name, "anchor"), away), noise.anchor_sigma)
-            )
+            rho = measured((name, "anchor"), seen(i, tick, centres[i] - late[i][:, tick]))
+            known.append(anchor_range(name, f"M{name}", tick, rho, noise.anchor_sigma))
     for i in range(robots):
         for j in range(i + 1, robots):
             if neighbours is not None and min(j - i, robots - j + i) > neighbours:
                 continue
             for tick in range(1, ticks + 1, 2):
-                apart = float(np.hypot(*(late[i][:, tick] - late[j][:, tick])))
-                rho = measured((names[i], names[j]), apart)
-                known.append(mutual_range(names[i], names[j], tick, rho, noise.mutual_sigma))
-    return MovingGroup(sorted(known, key=lambda one: one.key), noise, starts, ends, paths, delay)
+                one, other = (i, j) if tick % 4 == 1 else (j, i)
+                rho = measured(
+                    (names[i], names[j]), seen(one, tick, late[other][:, tick] - late[one][:, tick])
+                )
+                known.append(mutual_range(names[one], names[other], tick, rho, noise.mutual_sigma))
+    return MovingGroup(sorted(known, key=lambda one: one.key), noise, starts, ends, paths, delay, share)

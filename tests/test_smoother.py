@@ -36,10 +36,15 @@ def problem_of(
     survey: float,
     prior: bool,
     delay: float = 0.0,
+    depth: float = 0.0,
     strays: float = 0.0,
 ) -> Problem:
-    """Return the problem of a random group: with slow and surveying errors, a prior, a delay and strays."""
-    noise = replace(NOISE, slow_sigma=slow, survey_error=survey, range_delay=delay, odometry_strays=strays)
+    """Return the problem of a random group: with slow and surveying errors, a prior, a delay and strays.
+
+    `depth` is the prior of the share of ranges that is a depth.
+    """
+    errors = {"slow_sigma": slow, "survey_error": survey, "range_delay": delay, "range_depth": depth}
+    noise = replace(NOISE, odometry_strays=strays, **errors)
     measured = joint_measurements(moving_group(robots, seed, ticks=ticks, noise=noise).facts, noise, PERIOD_S)
     if prior:
         root = np.random.default_rng(seed).normal(size=(3 * robots, 3 * robots))
@@ -66,6 +71,7 @@ def point_of(of: Measured, seed: int) -> tuple[Array, Array, Array]:
     st.sampled_from([1e-3, 1.0, 1e9]),
     st.sampled_from([-1, 1]),
     st.sampled_from([0.0, 0.2]),
+    st.sampled_from([0.0, 0.5]),
     st.sampled_from([0.0, 0.1]),
 )
 def test_the_kernel_equals_its_text_to_the_bit(
@@ -78,16 +84,18 @@ def test_the_kernel_equals_its_text_to_the_bit(
     largest: float,
     scaled: int,
     delay: float,
+    depth: float,
     strays: float,
 ) -> None:
-    given_errors = {"slow": slow, "survey": survey, "delay": delay, "strays": strays}
+    given_errors = {"slow": slow, "survey": survey, "delay": delay, "depth": depth, "strays": strays}
     problem = problem_of(seed, robots, ticks, prior=prior, **given_errors)
     of, variance = problem.measured._replace(scaled=scaled), np.square(problem.weighing.sigma)
     of.radio[::3] = -1
     of.common[::4] = 0.0
     poses, constant, white = point_of(of, seed)
     kernel = Kernel(of, problem.weighing)
-    walk, text = kernel.walked(poses, constant, white), smoother.walked(of, poses, constant, white)
+    at = (poses, constant, white, 1.7)
+    walk, text = kernel.walked(*at), smoother.walked(of, *at)
     for one, other in zip(walk, text, strict=True):
         assert one.tobytes() == other.tobytes()
     given = (walk, poses, variance, 1e-12, largest)
@@ -107,6 +115,7 @@ def bits(of: Fitted | Point | tuple[object, ...]) -> list[bytes]:
     st.integers(1, 2),
     st.sampled_from([0.0, 0.08]),
     st.booleans(),
+    st.booleans(),
     st.sampled_from([(0.0, 0.0), (0.2, 0.0), (0.0, 1e-3), (0.2, 1e-3)]),
     st.sampled_from([0.0, 4.0]),
     st.sampled_from([Convergence(), Convergence(2, 0.05, 0.1), Convergence(0)]),
@@ -118,6 +127,7 @@ def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
     robots: int,
     slow: float,
     delayed: bool,
+    deep: bool,
     shares: tuple[float, float],
     degrees: float,
     until: Convergence,
@@ -128,6 +138,7 @@ def test_the_loop_of_a_fit_equals_its_text_to_the_bit(
         NOISE,
         slow_sigma=slow,
         range_delay=0.2 * delayed,
+        range_depth=0.5 * deep,
         outliers=shares[0],
         strays=shares[1],
         sigma_degrees=degrees,

@@ -15,6 +15,7 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation import smoother
+from agent.estimation.smoother import dot, effect_of
 from agent.estimation.fit import Fit, Start, deviation, fits, held_fits
 from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
 from agent.estimation.gaussian import joint_ranges
@@ -231,6 +232,7 @@ noises = st.builds(
     gyro_bias=st.sampled_from((0.0, 0.001)),
     sigma_degrees=st.sampled_from((0.0, 4.0)),
     strays=st.just(0.0),
+    range_depth=st.sampled_from((0.0, 0.5)),
 )
 
 
@@ -246,15 +248,17 @@ def test_a_range_changes_with_all_unknowns_as_the_linear_model_predicts(
     of, kernel, begin = problem.measured, problem.kernel, pair_start(one.guess, m2(one.pair))
     draw, poses, white = np.random.default_rng(seed), begin.poses.ravel(), np.zeros(of.white.shape)
     at = np.concatenate((np.zeros(6), draw.normal(size=of.size - 6)))
-    parts = (6, 6 + of.common.shape[1])
+    parts, rows = (6, 6 + of.common.shape[1]), range(len(of.rho))
 
     def predicted(unknowns: Array) -> Array:
         change, common, constant = np.split(unknowns, parts)
         walk = kernel.walked(moved(of, poses, change), constant.reshape(2, -1), white)
-        return np.asarray(of.rho - walk.residual + of.common @ common)
+        off = [dot([effect_of(of, walk, j, e) for e in range(len(common))], common) for j in rows]
+        return np.asarray(of.rho - walk.residual + off)
 
-    assume(float(np.min(predicted(at) - of.common @ at[6 : parts[1]])) > 0.1)
-    walk = kernel.walked(poses, at[parts[1] :].reshape(2, -1), white)
+    deep = float(at[6 + of.deep]) if of.deep >= 0 else 0.0
+    walk = kernel.walked(poses, at[parts[1] :].reshape(2, -1), white, deep)
+    assume(float(np.min(of.rho - walk.residual)) > 0.1)
     effects = smoother.forward(of, walk, poses, np.square(problem.weighing.sigma), update=False).effects
     assert np.array(effects) == pytest.approx(derivative(predicted, at), abs=1e-6)
 

@@ -233,10 +233,11 @@ def profiles(judged: Judged) -> str:
     """
     if judged.measured.only_rounding:
         return ""
-    found = contradiction(judged.fit, judged.measured)
+    recorded = judged.user == "recording"
+    found = contradiction(judged.fit, judged.measured, recorded=recorded)
     if found is None:
         return ""
-    return found.reason("--noise {}" if judged.user == "recording" else 'noise = "{}"')
+    return found.reason("--noise {}" if recorded else 'noise = "{}"')
 
 
 @condition("assured", "finder", "unanchored", "team", last=True)

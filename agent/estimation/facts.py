@@ -33,6 +33,8 @@ class MeasuredRange(NamedTuple):
     """The range in m."""
     sigma: float
     """The standard deviation of the range in m."""
+    by_second: bool = False
+    """True if the robot with the larger name has measured it."""
 
 
 class AnchorPlace(NamedTuple):

@@ -65,16 +65,16 @@ enum { NO_MEMORY = -2 };
 
 /* smoother.Measured: first the numbers, then the arrays, which `prepared` finds. */
 typedef struct {
-    Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed, strays;
+    Index robots, ticks, ranges, common, constant, anchors, radios, scaled, delayed, deep, strays;
     double period, survey, slow, decay, scale;
     const double *v, *omega, *slip, *white, *stray, *patterns, *place, *rho, *effects, *mean, *information;
     const double *pivot;
-    const Index *begin, *first, *second, *anchor, *radio;
+    const Index *begin, *first, *second, *eye, *anchor, *radio;
 } Measured;
 
 /* smoother.Walk */
 typedef struct {
-    double *place, *moves, *direction, *residual, *rate;
+    double *place, *moves, *direction, *residual, *rate, *turn, *ahead;
 } Walk;
 
 /* smoother.Passed and smoother.Adjoint; `row_of` has the places and derivatives of a range. Those from
@@ -123,8 +123,8 @@ typedef struct {
 } Fitted;
 
 typedef struct {
-    Index at[5];
-    double by[5];
+    Index at[6];
+    double by[6];
     int count;
 } Row;
 
@@ -242,7 +242,7 @@ static void velocity_of(const Measured *of, const Walk *walk, Index i, Index k, 
 }
 
 static void walked(
-    const Measured *of, const double *poses, const double *constants, const double *white, Walk *to)
+    const Measured *of, const double *poses, const double *constants, const double *white, double deep, Walk *to)
 {
     const Index K = of->ticks, m = of->constant;
     for (Index i = 0; i < of->robots; i++) {
@@ -287,7 +287,17 @@ static void walked(
             to->direction[2 * j] = dx / distance;
             to->direction[2 * j + 1] = dy / distance;
             to->residual[j] = of->rho[j] - distance;
-            to->rate[j] = 0.0;
+            to->rate[j] = to->turn[j] = to->ahead[j] = 0.0;
+            if (of->deep >= 0) {
+                const double share = deep * of->effects[j * of->common + of->deep];
+                const double heading = to->place[3 * (of->eye[j] * (K + 1) + k) + 2];
+                const double away = of->eye[j] == of->second[j] ? 1.0 : -1.0;
+                const double c = away * cos(heading), s = away * sin(heading), unit = 1.0 - share;
+                to->ahead[j] = dx * c + dy * s - distance;
+                to->turn[j] = share * (dy * c - dx * s);
+                to->direction[2 * j] = unit * to->direction[2 * j] + share * c;
+                to->direction[2 * j + 1] = unit * to->direction[2 * j + 1] + share * s;
+            }
             if (of->delayed >= 0 && k > 0) {
                 double by[2], of_other[2];
                 velocity_of(of, to, of->first[j], k, by);
@@ -296,7 +306,10 @@ static void walked(
                     by[0] -= of_other[0];
                     by[1] -= of_other[1];
                 }
-                to->rate[j] = to->direction[2 * j] * by[0] + to->direction[2 * j + 1] * by[1];
+                const Index before = of->eye[j] * K + k - 1;
+                const double turned = of->omega[before] + to->moves[8 * before + 7];
+                to->rate[j] =
+                    to->direction[2 * j] * by[0] + to->direction[2 * j + 1] * by[1] + to->turn[j] * turned;
             }
         }
 }
@@ -362,10 +375,16 @@ SIZED Row row_of(const Measured *of, const Walk *walk, Index j)
 {
     const double x = walk->direction[2 * j], y = walk->direction[2 * j + 1];
     Row row = {{3 * of->first[j], 3 * of->first[j] + 1}, {x, y}, 2};
+    if (of->deep >= 0) {
+        row.at[2] = 3 * of->eye[j] + 2;
+        row.by[2] = walk->turn[j];
+        row.count = 3;
+    }
     if (of->second[j] >= 0) {
-        row.at[2] = 3 * of->second[j]; row.by[2] = -x;
-        row.at[3] = 3 * of->second[j] + 1; row.by[3] = -y;
-        row.count = 4;
+        for (Index e = 0; e < 2; e++, row.count++) {
+            row.at[row.count] = 3 * of->second[j] + e;
+            row.by[row.count] = e ? -y : -x;
+        }
     }
     if (of->radios && of->radio[j] >= 0) {
         row.at[row.count] = 3 * of->robots + of->radio[j];
@@ -380,6 +399,7 @@ SIZED double effect_of(const Measured *of, const Walk *walk, Index j, Index e)
 {
     const double told = of->effects[j * of->common + e];
     if (e == of->delayed) return -told * walk->rate[j];
+    if (e == of->deep) return told * walk->ahead[j];
     return e == of->scaled && told != 0.0 ? of->scale * (of->rho[j] - walk->residual[j]) : told;
 }
 
@@ -965,7 +985,7 @@ static void predicted(const Measured *of, Point *at)
 {
     const Index n3 = 3 * of->robots, c = of->common;
     double cost = 0.0;
-    walked(of, at->poses, at->constant, at->white, &at->walk);
+    walked(of, at->poses, at->constant, at->white, of->deep < 0 ? 0.0 : at->common[of->deep], &at->walk);
     for (Index e = 0; e < c; e++) cost += at->common[e] * at->common[e];
     for (Index e = 0; e < of->robots * of->constant; e++) cost += at->constant[e] * at->constant[e];
     for (Index e = 0; e < 2 * of->robots * of->ticks; e++)
@@ -1185,7 +1205,7 @@ static int holding(const Measured *told, const Weighing *by, Index steps, Work *
 
 /* --- the memory --------------------------------------------------------------------------------------- */
 
-#define POINT 13
+#define POINT 15
 #define STEP 12
 #define ARRAYS (2 * POINT + STEP + 4)
 
@@ -1202,7 +1222,7 @@ static Index sizes_of(const Measured *of, Index sizes[ARRAYS])
     const Index n = of->robots, n3 = 3 * n, K = of->ticks, N = of->ranges, c = of->common;
     const Index size = estimated(of), ticks = of->strays * n * K;
     const Index point[POINT] = {
-        n3, c, n * of->constant, 2 * n * K, N, N, n3 * (K + 1), 8 * n * K, 2 * N, N, N, N, 1};
+        n3, c, n * of->constant, 2 * n * K, N, N, n3 * (K + 1), 8 * n * K, 2 * N, N, N, N, N, N, 1};
     const Index rest[] = {
         size, size, size * size, 2 * n * K, N, N, N, N, N, n3 * n3, 5 * ticks, 4, N, N, ticks, 6};
     memcpy(sizes, point, sizeof point);
@@ -1241,7 +1261,8 @@ void prepared(Measured *of, Weighing *by, const double *floats, const Index *num
     of->begin = numbers;
     of->first = of->begin + K + 2;
     of->second = of->first + N;
-    of->anchor = of->second + N;
+    of->eye = of->second + N;
+    of->anchor = of->eye + N;
     of->radio = of->anchor + N;
     by->holding = of->radio + N;
     by->by_radio = by->holding + N;
@@ -1250,13 +1271,14 @@ void prepared(Measured *of, Weighing *by, const double *floats, const Index *num
 }
 
 /* The paths, in the order of Walk. */
-void paths(const Measured *of, const double *poses, const double *constants, const double *white, double *to)
+void paths(
+    const Measured *of, const double *poses, const double *constants, const double *white, double deep, double *to)
 {
     Index sizes[ARRAYS];
     Walk walk;
     sizes_of(of, sizes);
-    placed((double **)&walk, to, sizes + 6, 5);
-    walked(of, poses, constants, white, &walk);
+    placed((double **)&walk, to, sizes + 6, 7);
+    walked(of, poses, constants, white, deep, &walk);
 }
 
 /* A step; returns 0 if the information of the unknowns is not positive definite, and -2 without memory. */
@@ -1268,7 +1290,7 @@ int gauss_newton_step(const Measured *of, double *walk, const double *poses, con
     Step to;
     Work w;
     sizes_of(of, sizes);
-    placed((double **)&from, walk, sizes + 6, 5);
+    placed((double **)&from, walk, sizes + 6, 7);
     placed((double **)&to, memory, sizes + 2 * POINT, STEP);
     double *space = workspace(of, &w);
     if (!space) return NO_MEMORY;

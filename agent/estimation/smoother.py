@@ -76,6 +76,10 @@ class Measured(NamedTuple):
     """its effect on a range of 1 m"""
     delayed: int
     """the one of them that is a delay, whose `common` is in s, and 0 where there is none; -1: none"""
+    deep: int
+    """the one of them that makes ranges depths, whose `common` is a share, and 0 where there is none; -1: none"""
+    eye: Places
+    """the robot that has measured each range, along whose heading a depth is; (N,)"""
     anchor: Places
     """the anchor of each range, among those that are not surveyed exactly; -1 for any other; (N,)"""
     anchors: int
@@ -127,11 +131,15 @@ class Walk(NamedTuple):
     """displacement of each tick per unit of v, the displacement, its derivative with respect to omega, and
     the errors of v and omega; (n, K, 8)"""
     direction: Array
-    """unit vectors from the anchor or the second robot; (N, 2)"""
+    """derivatives of the ranges by the place of the first robot: unit vectors but for depths; (N, 2)"""
     residual: Array
     """measured minus predicted ranges in m; (N,)"""
     rate: Array
     """range rates in m/s, at the end of the tick before; 0 at tick 0, and without a delay; (N,)"""
+    turn: Array
+    """derivatives of the ranges by the heading of the robot that has measured, in m; 0 but for depths; (N,)"""
+    ahead: Array
+    """depths along that heading minus distances, in m; 0 if ranges are no depths; (N,)"""
 
 
 class FitStep(NamedTuple):
@@ -175,8 +183,11 @@ class Singular(ArithmeticError):
     """The information of the unknowns is not positive definite."""
 
 
-def walked(of: Measured, poses: Array, constants: Array, white: Array) -> Walk:
-    """Return the paths from start `poses`, (3 n,), with constant and white errors, (n, m) and (n, 2, K)."""
+def walked(of: Measured, poses: Array, constants: Array, white: Array, deep: float = 0.0) -> Walk:
+    """Return the paths from start `poses`, (3 n,), with constant and white errors, (n, m) and (n, 2, K).
+
+    `deep` is the error in sigmas that makes ranges depths.
+    """
     place = [[poses[3 * i : 3 * i + 3].tolist()] for i in range(of.robots)]
     moves: list[Matrix] = [[] for _ in range(of.robots)]
     for i in range(of.robots):
@@ -201,7 +212,7 @@ def walked(of: Measured, poses: Array, constants: Array, white: Array) -> Walk:
             gy = v * slope * sy + 0.5 * of.period * dx
             moves[i].append([sx, sy, dx, dy, gx, gy, error_v, error_omega])
             place[i].append([x + dx, y + dy, heading + of.period * omega])
-    direction, residual, rate = [], [], []
+    direction, residual, rate, turn, ahead = [], [], [], [], []
     for k in range(of.ticks + 1):
         for j in range(of.begin[k], of.begin[k + 1]):
             at, other = place[of.first[j]][k], of.place[j]
@@ -211,19 +222,30 @@ def walked(of: Measured, poses: Array, constants: Array, white: Array) -> Walk:
             distance = max(math.sqrt(dx * dx + dy * dy), SMALLEST_DISTANCE)
             direction.append([dx / distance, dy / distance])
             residual.append(of.rho[j] - distance)
-            rate.append(0.0)
+            for none in (rate, turn, ahead):
+                none.append(0.0)
+            if of.deep >= 0:
+                share = deep * of.common[j, of.deep]
+                heading, away = place[of.eye[j]][k][2], 1.0 if of.eye[j] == of.second[j] else -1.0
+                c, s, unit = away * math.cos(heading), away * math.sin(heading), 1.0 - share
+                ahead[j] = dx * c + dy * s - distance
+                turn[j] = share * (dy * c - dx * s)
+                direction[j] = [unit * direction[j][0] + share * c, unit * direction[j][1] + share * s]
             if of.delayed >= 0 and k > 0:
                 vx, vy = _velocity(of, place, moves, of.first[j], k)
                 if of.second[j] >= 0:
                     other_vx, other_vy = _velocity(of, place, moves, of.second[j], k)
                     vx, vy = vx - other_vx, vy - other_vy
-                rate[j] = direction[j][0] * vx + direction[j][1] * vy
+                turned = of.omega[of.eye[j], k - 1] + moves[of.eye[j]][k - 1][7]
+                rate[j] = direction[j][0] * vx + direction[j][1] * vy + turn[j] * turned
     return Walk(
         np.array(place),
         np.array(moves).reshape(of.robots, of.ticks, 8),
         np.array(direction),
         np.array(residual),
         np.array(rate),
+        np.array(turn),
+        np.array(ahead),
     )
 
 
@@ -354,6 +376,8 @@ def _row(of: Measured, walk: Walk, j: int) -> list[tuple[int, float]]:
     """Return the derivatives of range `j` with respect to the state, by their places."""
     x, y = walk.direction[j].tolist()
     row = [(3 * of.first[j], x), (3 * of.first[j] + 1, y)]
+    if of.deep >= 0:
+        row.append((3 * of.eye[j] + 2, float(walk.turn[j])))
     if of.second[j] >= 0:
         row += [(3 * of.second[j], -x), (3 * of.second[j] + 1, -y)]
     if of.radios and of.radio[j] >= 0:
@@ -366,6 +390,8 @@ def effect_of(of: Measured, walk: Walk, j: int, e: int) -> float:
     told = float(of.common[j, e])
     if e == of.delayed:
         return -told * float(walk.rate[j])
+    if e == of.deep:
+        return told * float(walk.ahead[j])
     if e == of.scaled and told != 0.0:
         return of.scale * float(of.rho[j] - walk.residual[j])
     return told

@@ -371,6 +371,10 @@ def _check_noise(mission: Mission) -> None:
         raise BadScenario(
             f"mission.noise.outlier_bias: the lower bound {least:.6g} m is above the upper bound {most:.6g} m"
         )
+    if mission.noise.range_depth:
+        raise BadScenario(
+            "mission.noise.range_depth: only in recordings may ranges be depths, as of a camera"
+        )
     why = too_small(mission.noise) or noise_infeasibility(mission) or safety_infeasibility(mission)
     if why is not None:
         raise Unworkable(f"mission.{why}")

@@ -31,7 +31,7 @@ FIELDS_OF_USERS: Mapping[User, Mapping[str, str]] = {
         "": "name max_ticks planner kill clock robot.attack group.attack team.attack",
         "mission.": "accuracy confidence safety_distance tolerates survey",
         "mission.noise.": "range_bias pair_bias range_scale slow_sigma slow_time wheel_scale gyro_bias "
-        "sigma_degrees survey_error range_delay strays odometry_strays",
+        "sigma_degrees survey_error range_delay range_depth strays odometry_strays",
     },
     "both": {
         "mission.noise.": " ".join((*RANGE_FIELDS, "profile")),

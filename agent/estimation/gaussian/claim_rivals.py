@@ -97,5 +97,6 @@ def _holding(
         np.array([-1]),
         anchor[None],
         np.array([-1]),
+        np.array([False]),
     )
     return replace(measured, ranges=measured.ranges.then(more))

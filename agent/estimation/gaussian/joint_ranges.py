@@ -70,6 +70,8 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
 
     -1 for a range that has no error but a white one, and is no outlier.
     """
+    by_second: NDArray[np.bool]
+    """True if the second radio has measured the range: a depth is along the heading of who did; shape (N,)."""
 
     @cached_property
     def radios(self) -> list[int]:
@@ -95,12 +97,14 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     def common_errors(self, priors: Priors) -> Array:
         """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
 
-        The errors are a bias of all ranges, a scale, a bias of each pair of radios, and a delay. The scale
-        multiplies the measured ranges: then the effects are the same under each guess. The column of the
-        delay is in s: its effect is minus the range rate (see `smoother`).
+        The errors are a bias of all ranges, a scale, a bias of each pair of radios, a delay, and the share of
+        ranges that is a depth. The scale multiplies the measured ranges: then the effects are the same under
+        each guess. Those of the delay, whose column is in s, and of the depth follow from the poses (see
+        `smoother`).
         """
         rho, radios = self.rho, self.radios if priors.pair_bias else []
-        size = bool(priors.range_bias) + bool(priors.range_scale) + len(radios) + bool(priors.range_delay)
+        last = [one for one in (priors.range_delay, priors.range_depth) if one]
+        size = bool(priors.range_bias) + bool(priors.range_scale) + len(radios) + len(last)
         found, column = np.empty((len(rho), size)), 0
         if priors.range_bias:
             found[:, column], column = priors.range_bias, column + 1
@@ -108,8 +112,9 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
             found[:, column], column = priors.range_scale * rho, column + 1
         if radios:
             found[:, column : column + len(radios)] = priors.pair_bias * (self.radio[:, None] == radios)
-        if priors.range_delay:
-            found[:, -1] = priors.range_delay
+        found[:, size - len(last) :] = last
+        if priors.range_depth:
+            found[self.by_second & (self.second < 0), -1] = 0.0  # the beacon has measured
         return found
 
     def rows(self, some: NDArray[np.bool] | Places) -> JointRanges:

@@ -62,6 +62,7 @@ def near_anchors(
         np.where(kind == robots, 1, -1),
         np.array([*places, (0.0, 0.0)])[kind],
         kind,
+        np.zeros(len(kind), bool),
     )
     return JointMeasurements(
         *(("a", "b")[:robots], (), (), tuple(paths), ranges, paths[0].period, (0.0, 0.0), noise),
@@ -121,6 +122,7 @@ def of_rows(
             np.array([index.get(row.second, -1) for row in rows], np.intp),
             np.array([(one.x - origin.x, one.y - origin.y) for one in at], np.float64).reshape(-1, 2),
             np.array([radio[row.first, row.second] for row in rows], np.intp),
+            np.array([row.measured.by_second for row in rows], bool),
         ),
         period,
         (origin.x, origin.y),

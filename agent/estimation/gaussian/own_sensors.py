@@ -108,15 +108,15 @@ def doubt(own: JointMeasurements, pair: JointMeasurements | None = None, robot: 
 
 
 @lru_cache(maxsize=2)
-def contradiction(fitted: Fit, measured: JointMeasurements) -> Doubt | None:
+def contradiction(fitted: Fit, measured: JointMeasurements, *, recorded: bool = False) -> Doubt | None:
     """Return the profile that explains what was `measured` much better than the told noise.
 
-    `fitted` is the fit to it that would be claimed. Only constant errors are compared: slow ones and strays
+    `fitted` is the fit to it that would be claimed; what was `recorded` may be of cameras. Only constant errors are compared: slow ones and strays
     do not move a pose by more than the noise level that robots learn. Biases are in proportion to the sigma.
     """
     noise = measured.noise
     others, size = {}, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA
-    for name in _others(noise):
+    for name in _others(noise) + ["camera"] * (recorded and not noise.range_depth):
         other = _profile(name, noise)
         biases = {one: size * getattr(other.priors, one) for one in ("range_bias", "pair_bias")}
         other = replace(other, slow_sigma=noise.slow_sigma, strays=noise.strays, **biases)
@@ -146,7 +146,7 @@ def _others(noise: Noise) -> list[ProfileName]:
 
 
 NARROWEST_FIRST: tuple[ProfileName, ...] = ("wheels", "uwb-calibrated", "uwb")
-"""The profiles, in the order of their priors."""
+"""The profiles of missions, in the order of their priors."""
 
 
 def _best(what: str, log_evidence: dict[ProfileName, float], least: float) -> Doubt | None:

@@ -115,10 +115,11 @@ def learned_errors(fitted: EpochFit | None, pairs: Sequence[str]) -> LearnedErro
     scale = next_of(priors.range_scale) if priors.range_scale else None
     of_pairs = {name: next_of(priors.pair_bias) for name in pairs if priors.pair_bias}
     delay = next_of(priors.range_delay) if priors.range_delay else None
+    depth = next_of(priors.range_depth) if priors.range_depth else None
     odometry = (priors.wheel_scale, priors.wheel_scale, priors.gyro_bias)
     own = {name: [next_of(prior) for prior in odometry] for name in names if priors.of_odometry}
     wheels, turns, gyros = [{name: each[k] for name, each in own.items()} for k in range(3)]
-    return LearnedErrors(fit.level**0.5, bias, scale, of_pairs, delay, wheels, turns, gyros)
+    return LearnedErrors(fit.level**0.5, bias, scale, of_pairs, delay, depth, wheels, turns, gyros)
 
 
 def _anchors(

@@ -338,7 +338,7 @@ def _ranges(
     columns = [each.tolist() for each in (ranges.first, ranges.second, ticks, rho, sigma)]
     for first, second, tick, distance, spread in zip(*columns, strict=True):
         robot, other = radios[first], radios[second]
-        measured = MeasuredRange(distance + 0.0, spread + 0.0)
+        measured = MeasuredRange(distance + 0.0, spread + 0.0, second < count and other < robot)
         if second < count:
             yield MeasuredRow(True, min(robot, other), max(robot, other), tick, measured)
         elif other in own[first]:

@@ -1,0 +1,109 @@
+"""Ranges that are depths along the heading of the robot, as of a camera, are recognised, and used as such."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from msgspec.structs import replace
+
+from agent.estimation.fit import Start, fits
+from agent.estimation.following import ClaimRule
+from compose import scenario
+from compose.recording.estimating.estimate_rows import LearnedError
+from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
+from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
+from docs.recorded_windows import is_wrong
+from tests.commands import refused, tandem
+from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
+from tests.test_anchored import driven
+
+NOISY = Path(scenario.__file__).parent / "shipped" / "noisy.toml"
+SIGMA = 0.05
+HALF_VIEW = math.radians(35.0)
+LANDMARKS = tuple([
+    FixedAnchor(f"L{k:02}", 4.0 + (4.0 + k % 3) * math.cos(k), 3.0 + (4.0 + k % 3) * math.sin(k))
+    for k in range(24)
+])  # fmt: skip
+
+
+def seen(seed: int, *, share: float) -> RangeRecording:
+    """Return a recording of one robot that measures the landmarks in its view; 1 as `share`: their depth."""
+    recording = driven(LANDMARKS, seed=seed)
+    (robot,), ranges = recording.robots, recording.ranges
+    assert robot.truth is not None
+    x, y, heading = [np.interp(ranges.t, robot.truth.t, axis) for axis in robot.truth.poses.T]
+    landmarks = np.array([(one.x, one.y) for one in LANDMARKS])
+    away = landmarks[:, None] - np.stack((x, y), 1)  # of each landmark at each time
+    bearing = np.abs(np.angle(np.exp(1j * (np.arctan2(away[..., 1], away[..., 0]) - heading))))
+    far, at = np.hypot(away[..., 0], away[..., 1]), np.arange(len(x))
+    nearest = np.where(bearing < HALF_VIEW, far, np.inf)
+    which = np.argsort(nearest, 0)[at % 2, at]
+    distance = far[which, at]
+    depth = distance * np.cos(bearing[which, at])
+    measured = (1.0 - share) * distance + share * depth
+    measured += SIGMA * np.random.default_rng(seed).standard_normal(len(x))
+    told = ranges._replace(second=1 + which, range=measured, sigma=np.full(len(x), SIGMA))
+    return recording._replace(ranges=told.rows(np.isfinite(nearest[which, at])))
+
+
+def estimate_of(recording: RangeRecording, noise: str | None = None) -> RecordingEstimate:
+    return estimated(measurements(recording, None, noise), ClaimRule())
+
+
+def depth_of(found: RecordingEstimate) -> LearnedError:
+    assert found.summary.calibration is not None
+    learned = found.summary.calibration.range_depth
+    assert learned is not None
+    return learned
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+@pytest.mark.parametrize("noise", [None, "camera"])
+def test_a_recording_tells_whether_its_ranges_are_depths_and_claims_are_right(
+    share: float, noise: str | None
+) -> None:
+    for seed in range(3):
+        found = estimate_of(seen(seed, share=share), noise)
+        claims = [row for row in found.rows if row.claim and row.nees is not None]
+        assert len(claims) > 20
+        assert not any(map(is_wrong, claims))
+        learned = depth_of(found)
+        assert abs(learned.value - share) < 4.0 * learned.sigma < 0.5
+
+
+@pytest.mark.parametrize("noise", ["wheels", "uwb-calibrated"])
+def test_a_robot_with_a_camera_that_is_told_radios_claims_no_wrong_pose_and_hears_of_cameras(
+    noise: str,
+) -> None:
+    found = [estimate_of(seen(seed, share=1.0), noise) for seed in range(3)]
+    assert not any(is_wrong(row) for one in found for row in one.rows if row.claim and row.nees is not None)
+    reasons = [epoch.blocking_reason for one in found for epoch in one.epochs]
+    assert any("the profile 'camera' explains them better" in reason for reason in reasons)
+
+
+def test_the_share_of_depths_is_estimated_within_its_sigma_whichever_robot_has_measured() -> None:
+    noise, off = replace(NOISE, range_depth=0.15), []
+    for seed in range(20):
+        group = moving_group(2, seed, ticks=60, noise=noise)
+        measured = joint_measurements(group.facts, noise, PERIOD_S)
+        assert 0 < np.count_nonzero(measured.ranges.by_second) < len(measured.ranges.rho)
+        starts = group.starts.copy()
+        starts[:, :2] -= measured.origin
+        (fit,) = fits(measured, [Start(starts)])
+        column = fit.problem.measured.deep
+        assert fit.constant_sigmas[column] < 0.1
+        off.append((group.share / 0.15 - fit.constants[column]) / fit.constant_sigmas[column])
+    assert max(map(abs, off)) < 4.0
+    assert 6.0 < np.sum(np.square(off)) < 42.0  # chi-square of 20 degrees of freedom: 0.2 and 99.7 %
+
+
+@pytest.mark.parametrize("noise", ['profile = "camera"', "range_depth = 0.5"])
+def test_a_mission_has_no_depths(tmp_path: Path, noise: str) -> None:
+    path, noisy = tmp_path / "seen.toml", NOISY.read_text()
+    path.write_text(noisy.replace("[mission.noise]", f"[mission.noise]\n{noise}"))
+    what = "mission.noise.range_depth: only in recordings may ranges be depths, as of a camera"
+    refused(tandem("run", path), what)
