@@ -132,11 +132,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     range_delay: Delay = 0.0
     """The prior of the delay in s of all ranges: of their stamps after the time of the measurement."""
     range_depth: Fraction = 0.0
-    """The prior of the share of ranges that is a depth, along the heading of the robot that has measured.
-
-    A camera measures depths: shorter than distances by 1 - cos of the bearing. For recordings only, as they
-    tell which robot has measured.
-    """
+    """The prior of the share of ranges that is a depth, along the heading of who has measured; recordings only."""
     strays: Probability = 1e-3
     """The probability that a range has an error of any size and sign; without noise, there are none."""
     odometry_strays: Probability = 0.0
@@ -225,7 +221,6 @@ PROFILES: Mapping[ProfileName, Mapping[str, Any]] = {
         "range_scale": 0.03,
         "wheel_scale": 0.02,
         "gyro_bias": 0.005,
-        "range_delay": 0.1,
         "range_depth": 0.5,
         "strays": 0.02,
     },

@@ -147,7 +147,7 @@ def moving_group(
     centres = draw.uniform(0.0, side, (robots, 2))
     bias, scale = priors.range_bias * draw.normal(), priors.range_scale * draw.normal()
     delay = priors.range_delay * draw.normal() if priors.range_delay else 0.0
-    share = priors.range_depth * draw.normal() if priors.range_depth else 0.0
+    share = priors.range_depth * np.random.default_rng((robots, seed, robots)).normal()
     headings = np.empty((robots, ticks + 1))
     late: list[Array] = []
     pair_bias: dict[frozenset[str], float] = {}

@@ -15,7 +15,6 @@ from msgspec.structs import replace
 from numpy.typing import NDArray
 
 from agent.estimation import smoother
-from agent.estimation.smoother import dot, effect_of
 from agent.estimation.fit import Fit, Start, deviation, fits, held_fits
 from agent.estimation.gauss_newton import LAST_STEP, Convergence, moved
 from agent.estimation.gaussian import joint_ranges
@@ -33,6 +32,7 @@ from agent.estimation.gaussian.odometry_noise import (
 )
 from agent.estimation.gaussian.range_model import SIGMA_FLOOR
 from agent.estimation.problem import MOST_MEASURED_LENGTHS, Problem
+from agent.estimation.smoother import dot, effect_of
 from protocol.motion import ORIGIN, Pose, rotated, step
 from protocol.noise import Noise, VelocityNoise
 from tests.hypotheses_by_numpy import position_variances_by_numpy
@@ -253,7 +253,7 @@ def test_a_range_changes_with_all_unknowns_as_the_linear_model_predicts(
     def predicted(unknowns: Array) -> Array:
         change, common, constant = np.split(unknowns, parts)
         walk = kernel.walked(moved(of, poses, change), constant.reshape(2, -1), white)
-        off = [dot([effect_of(of, walk, j, e) for e in range(len(common))], common) for j in rows]
+        off = [dot([effect_of(of, walk, j, e) for e in range(len(common))], common.tolist()) for j in rows]
         return np.asarray(of.rho - walk.residual + off)
 
     deep = float(at[6 + of.deep]) if of.deep >= 0 else 0.0

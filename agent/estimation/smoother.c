@@ -42,7 +42,7 @@ const char *compiler(void)
 #define LARGEST_STEP 0.3
 #define DESCENT 1e-6
 #define SETTLED_WEIGHT 1e-2
-#define TURNING 0.5
+#define DAMPING 0.5
 #define RIDGE 1e-12
 #define GRAIN 1e-12
 #define LEAST_VARIANCE 1e-300
@@ -241,6 +241,44 @@ static void velocity_of(const Measured *of, const Walk *walk, Index i, Index k, 
     by[1] = v * sin(course);
 }
 
+/* The direction, the residual, the rate, and what makes a depth of range `j`, at tick `k`. */
+static void predict(const Measured *of, double deep, Index j, Index k, Walk *to)
+{
+    const Index ticks = of->ticks + 1, first = of->first[j], second = of->second[j], eye = of->eye[j];
+    const double *at = to->place + 3 * (first * ticks + k), *other = of->place + 2 * j;
+    if (second >= 0) other = to->place + 3 * (second * ticks + k);
+    const double dx = at[0] - other[0], dy = at[1] - other[1];
+    double distance = sqrt(dx * dx + dy * dy);
+    if (distance < SMALLEST_DISTANCE) distance = SMALLEST_DISTANCE;
+    double x = dx / distance, y = dy / distance;
+    to->residual[j] = of->rho[j] - distance;
+    to->rate[j] = to->turn[j] = to->ahead[j] = 0.0;
+    if (of->deep >= 0) {
+        const double share = deep * of->effects[j * of->common + of->deep];
+        const double heading = to->place[3 * (eye * ticks + k) + 2];
+        const double away = eye == second ? 1.0 : -1.0, unit = 1.0 - share;
+        const double c = away * cos(heading), s = away * sin(heading);
+        to->ahead[j] = dx * c + dy * s - distance;
+        to->turn[j] = share * (dy * c - dx * s);
+        x = unit * x + share * c;
+        y = unit * y + share * s;
+    }
+    to->direction[2 * j] = x;
+    to->direction[2 * j + 1] = y;
+    if (of->delayed >= 0 && k > 0) {
+        double by[2], of_other[2];
+        velocity_of(of, to, first, k, by);
+        if (second >= 0) {
+            velocity_of(of, to, second, k, of_other);
+            by[0] -= of_other[0];
+            by[1] -= of_other[1];
+        }
+        const Index before = eye * of->ticks + k - 1;
+        const double turned = of->omega[before] + to->moves[8 * before + 7];
+        to->rate[j] = x * by[0] + y * by[1] + to->turn[j] * turned;
+    }
+}
+
 static void walked(
     const Measured *of, const double *poses, const double *constants, const double *white, double deep, Walk *to)
 {
@@ -278,40 +316,7 @@ static void walked(
         }
     }
     for (Index k = 0; k <= K; k++)
-        for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) {
-            const double *at = to->place + 3 * (of->first[j] * (K + 1) + k), *other = of->place + 2 * j;
-            if (of->second[j] >= 0) other = to->place + 3 * (of->second[j] * (K + 1) + k);
-            const double dx = at[0] - other[0], dy = at[1] - other[1];
-            double distance = sqrt(dx * dx + dy * dy);
-            if (distance < SMALLEST_DISTANCE) distance = SMALLEST_DISTANCE;
-            to->direction[2 * j] = dx / distance;
-            to->direction[2 * j + 1] = dy / distance;
-            to->residual[j] = of->rho[j] - distance;
-            to->rate[j] = to->turn[j] = to->ahead[j] = 0.0;
-            if (of->deep >= 0) {
-                const double share = deep * of->effects[j * of->common + of->deep];
-                const double heading = to->place[3 * (of->eye[j] * (K + 1) + k) + 2];
-                const double away = of->eye[j] == of->second[j] ? 1.0 : -1.0;
-                const double c = away * cos(heading), s = away * sin(heading), unit = 1.0 - share;
-                to->ahead[j] = dx * c + dy * s - distance;
-                to->turn[j] = share * (dy * c - dx * s);
-                to->direction[2 * j] = unit * to->direction[2 * j] + share * c;
-                to->direction[2 * j + 1] = unit * to->direction[2 * j + 1] + share * s;
-            }
-            if (of->delayed >= 0 && k > 0) {
-                double by[2], of_other[2];
-                velocity_of(of, to, of->first[j], k, by);
-                if (of->second[j] >= 0) {
-                    velocity_of(of, to, of->second[j], k, of_other);
-                    by[0] -= of_other[0];
-                    by[1] -= of_other[1];
-                }
-                const Index before = of->eye[j] * K + k - 1;
-                const double turned = of->omega[before] + to->moves[8 * before + 7];
-                to->rate[j] =
-                    to->direction[2 * j] * by[0] + to->direction[2 * j + 1] * by[1] + to->turn[j] * turned;
-            }
-        }
+        for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) predict(of, deep, j, k, to);
 }
 
 /* The derivatives of the start pose of robot `i` with respect to its unknowns. */
@@ -1156,7 +1161,7 @@ static int converged(
         }
         for (Index j = 0; j < of->ranges; j++) {
             const double change = w->updated[j] - to->weights[j];
-            if (number > 1 && change * w->last[j] < 0.0) w->share[j] *= TURNING;
+            if (number > 1 && change * w->last[j] < 0.0) w->share[j] *= DAMPING;
             w->last[j] = change;
             to->weights[j] += w->share[j] * change;
         }

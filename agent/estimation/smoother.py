@@ -77,9 +77,9 @@ class Measured(NamedTuple):
     delayed: int
     """the one of them that is a delay, whose `common` is in s, and 0 where there is none; -1: none"""
     deep: int
-    """the one of them that makes ranges depths, whose `common` is a share, and 0 where there is none; -1: none"""
+    """the one of them that makes ranges depths, whose `common` is a share; -1: none"""
     eye: Places
-    """the robot that has measured each range, along whose heading a depth is; (N,)"""
+    """the robot that has measured each range; a depth is along its heading; (N,)"""
     anchor: Places
     """the anchor of each range, among those that are not surveyed exactly; -1 for any other; (N,)"""
     anchors: int
@@ -137,7 +137,7 @@ class Walk(NamedTuple):
     rate: Array
     """range rates in m/s, at the end of the tick before; 0 at tick 0, and without a delay; (N,)"""
     turn: Array
-    """derivatives of the ranges by the heading of the robot that has measured, in m; 0 but for depths; (N,)"""
+    """derivatives of the ranges by the heading of who has measured, in m; 0 but for depths; (N,)"""
     ahead: Array
     """depths along that heading minus distances, in m; 0 if ranges are no depths; (N,)"""
 
@@ -188,6 +188,15 @@ def walked(of: Measured, poses: Array, constants: Array, white: Array, deep: flo
 
     `deep` is the error in sigmas that makes ranges depths.
     """
+    place, moves = _driven(of, poses, constants, white)
+    ranges = [(j, k) for k in range(of.ticks + 1) for j in range(of.begin[k], of.begin[k + 1])]
+    rows = np.array([_predicted(of, place, moves, j, k, deep) for j, k in ranges]).reshape(-1, 6)
+    moved = np.array(moves).reshape(of.robots, of.ticks, 8)
+    return Walk(np.array(place), moved, rows[:, :2], *np.ascontiguousarray(rows[:, 2:].T))
+
+
+def _driven(of: Measured, poses: Array, constants: Array, white: Array) -> tuple[list[Matrix], list[Matrix]]:
+    """Return x, y and heading of each robot at each tick, and the `moves` of each tick (see Walk)."""
     place = [[poses[3 * i : 3 * i + 3].tolist()] for i in range(of.robots)]
     moves: list[Matrix] = [[] for _ in range(of.robots)]
     for i in range(of.robots):
@@ -212,41 +221,32 @@ def walked(of: Measured, poses: Array, constants: Array, white: Array, deep: flo
             gy = v * slope * sy + 0.5 * of.period * dx
             moves[i].append([sx, sy, dx, dy, gx, gy, error_v, error_omega])
             place[i].append([x + dx, y + dy, heading + of.period * omega])
-    direction, residual, rate, turn, ahead = [], [], [], [], []
-    for k in range(of.ticks + 1):
-        for j in range(of.begin[k], of.begin[k + 1]):
-            at, other = place[of.first[j]][k], of.place[j]
-            if of.second[j] >= 0:
-                other = place[of.second[j]][k]
-            dx, dy = at[0] - other[0], at[1] - other[1]
-            distance = max(math.sqrt(dx * dx + dy * dy), SMALLEST_DISTANCE)
-            direction.append([dx / distance, dy / distance])
-            residual.append(of.rho[j] - distance)
-            for none in (rate, turn, ahead):
-                none.append(0.0)
-            if of.deep >= 0:
-                share = deep * of.common[j, of.deep]
-                heading, away = place[of.eye[j]][k][2], 1.0 if of.eye[j] == of.second[j] else -1.0
-                c, s, unit = away * math.cos(heading), away * math.sin(heading), 1.0 - share
-                ahead[j] = dx * c + dy * s - distance
-                turn[j] = share * (dy * c - dx * s)
-                direction[j] = [unit * direction[j][0] + share * c, unit * direction[j][1] + share * s]
-            if of.delayed >= 0 and k > 0:
-                vx, vy = _velocity(of, place, moves, of.first[j], k)
-                if of.second[j] >= 0:
-                    other_vx, other_vy = _velocity(of, place, moves, of.second[j], k)
-                    vx, vy = vx - other_vx, vy - other_vy
-                turned = of.omega[of.eye[j], k - 1] + moves[of.eye[j]][k - 1][7]
-                rate[j] = direction[j][0] * vx + direction[j][1] * vy + turn[j] * turned
-    return Walk(
-        np.array(place),
-        np.array(moves).reshape(of.robots, of.ticks, 8),
-        np.array(direction),
-        np.array(residual),
-        np.array(rate),
-        np.array(turn),
-        np.array(ahead),
-    )
+    return place, moves
+
+
+def _predicted(of: Measured, place: list[Matrix], moves: list[Matrix], j: int, k: int, deep: float) -> Vector:
+    """Return direction, residual, rate, turn and ahead of range `j`, at tick `k` (see Walk)."""
+    at, other = place[of.first[j]][k], of.place[j]
+    if of.second[j] >= 0:
+        other = place[of.second[j]][k]
+    dx, dy = at[0] - other[0], at[1] - other[1]
+    distance = max(math.sqrt(dx * dx + dy * dy), SMALLEST_DISTANCE)
+    x, y, rate, turn, ahead = dx / distance, dy / distance, 0.0, 0.0, 0.0
+    if of.deep >= 0:
+        share, heading = deep * of.common[j, of.deep], place[of.eye[j]][k][2]
+        away, unit = 1.0 if of.eye[j] == of.second[j] else -1.0, 1.0 - share
+        c, s = away * math.cos(heading), away * math.sin(heading)
+        ahead = dx * c + dy * s - distance
+        turn = share * (dy * c - dx * s)
+        x, y = unit * x + share * c, unit * y + share * s
+    if of.delayed >= 0 and k > 0:
+        vx, vy = _velocity(of, place, moves, of.first[j], k)
+        if of.second[j] >= 0:
+            other_vx, other_vy = _velocity(of, place, moves, of.second[j], k)
+            vx, vy = vx - other_vx, vy - other_vy
+        turned = of.omega[of.eye[j], k - 1] + moves[of.eye[j]][k - 1][7]
+        rate = x * vx + y * vy + turn * turned
+    return [x, y, of.rho[j] - distance, rate, turn, ahead]
 
 
 def _velocity(of: Measured, place: list[Matrix], moves: list[Matrix], i: int, k: int) -> tuple[float, float]:

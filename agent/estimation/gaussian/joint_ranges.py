@@ -71,7 +71,7 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     -1 for a range that has no error but a white one, and is no outlier.
     """
     by_second: NDArray[np.bool]
-    """True if the second radio has measured the range: a depth is along the heading of who did; shape (N,)."""
+    """True if the second one has measured the range; a depth is along the heading of who has; shape (N,)."""
 
     @cached_property
     def radios(self) -> list[int]:
