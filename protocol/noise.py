@@ -132,7 +132,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     range_delay: Delay = 0.0
     """The prior of the delay in s of all ranges: of their stamps after the time of the measurement."""
     range_depth: Fraction = 0.0
-    """The prior of the share of ranges that is a depth, along the heading of who has measured; recordings only."""
+    """The prior of the share of ranges that is a depth, along the heading of who measured; for recordings."""
     strays: Probability = 1e-3
     """The probability that a range has an error of any size and sign; without noise, there are none."""
     odometry_strays: Probability = 0.0

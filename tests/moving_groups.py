@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
@@ -200,14 +201,12 @@ def moving_group(
         for tick in range(0, ticks + 1, 2):
             rho = measured((name, "anchor"), seen(i, tick, centres[i] - late[i][:, tick]))
             known.append(anchor_range(name, f"M{name}", tick, rho, noise.anchor_sigma))
-    for i in range(robots):
-        for j in range(i + 1, robots):
-            if neighbours is not None and min(j - i, robots - j + i) > neighbours:
-                continue
-            for tick in range(1, ticks + 1, 2):
-                one, other = (i, j) if tick % 4 == 1 else (j, i)
-                rho = measured(
-                    (names[i], names[j]), seen(one, tick, late[other][:, tick] - late[one][:, tick])
-                )
-                known.append(mutual_range(names[one], names[other], tick, rho, noise.mutual_sigma))
+    for i, j in combinations(range(robots), 2):
+        if neighbours is not None and min(j - i, robots - j + i) > neighbours:
+            continue
+        for tick in range(1, ticks + 1, 2):
+            one, other = (i, j) if tick % 4 == 1 else (j, i)
+            away = late[other][:, tick] - late[one][:, tick]
+            rho = measured((names[i], names[j]), seen(one, tick, away))
+            known.append(mutual_range(names[one], names[other], tick, rho, noise.mutual_sigma))
     return MovingGroup(sorted(known, key=lambda one: one.key), noise, starts, ends, paths, delay, share)

@@ -64,7 +64,7 @@ DESCENT = 1e-6
 SETTLED_WEIGHT = 1e-2
 """The change of a weight below which the weights have converged."""
 
-DAMPING = 0.5
+TURNED = 0.5
 """The factor by which a weight takes less of its changes from each one on that turns, after two steps.
 
 With 1, weights of ranges that are as probably outliers as not go to and fro for ever, and the fit with them.
@@ -255,7 +255,7 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
         for j, new in enumerate(updated):
             change = new - weight[j]
             if number > 1 and change * last[j] < 0.0:
-                share[j] *= DAMPING
+                share[j] *= TURNED
             last[j] = change
             weight[j] += share[j] * change
         sound, before = sounder, length

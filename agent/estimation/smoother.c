@@ -42,7 +42,7 @@ const char *compiler(void)
 #define LARGEST_STEP 0.3
 #define DESCENT 1e-6
 #define SETTLED_WEIGHT 1e-2
-#define DAMPING 0.5
+#define TURNED 0.5
 #define RIDGE 1e-12
 #define GRAIN 1e-12
 #define LEAST_VARIANCE 1e-300
@@ -1161,7 +1161,7 @@ static int converged(
         }
         for (Index j = 0; j < of->ranges; j++) {
             const double change = w->updated[j] - to->weights[j];
-            if (number > 1 && change * w->last[j] < 0.0) w->share[j] *= DAMPING;
+            if (number > 1 && change * w->last[j] < 0.0) w->share[j] *= TURNED;
             w->last[j] = change;
             to->weights[j] += w->share[j] * change;
         }
