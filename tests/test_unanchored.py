@@ -29,7 +29,8 @@ from compose.recording.corrected_bounds import corrected_bounds
 from compose.recording.reasons import reason_for
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames, read
-from compose.scenario.scenario_file import load, parse, validate
+from compose.scenario.scenario_file import load, parse, scenario_table, validate
+from compose.sweep.hunt.invariants import truth_lost
 from protocol.coverage_strips import SweptArea
 from protocol.journal.journal_file import CorruptJournal
 from protocol.messages import (
@@ -205,6 +206,16 @@ def test_the_strips_of_a_robot_that_dies_there_are_swept_by_others() -> None:
 def test_lost_and_late_reports_only_cost_time(fault: dict[str, Any]) -> None:
     run = run_mission(scenario_of(four(fault=[fault])))
     assert len(localised(run)) == 4
+
+
+def test_a_range_from_where_a_square_ends_tells_no_heading() -> None:
+    """The first report from after the square is of a tick in which the robot was back."""
+    faults = [{"delay": [5, 10]}, {}, {}, {}, {"corrupt": 0.4}, {"delay": [6, 10], "contact_ticks": [1, 31]}]
+    group = {"robots": 4, "spacing": 6.930000000000001, "without_anchor": 1}
+    table = {**scenario_table("random-group"), "seed": 201761783, "group": group, "fault": faults}
+    run = of_frames(kept(scenario_of(table)))
+    assert len(localised(run)) == 4
+    assert not list(truth_lost(run))
 
 
 def test_reports_in_another_order_lead_to_the_same_claim_to_the_bit() -> None:

@@ -33,6 +33,12 @@ LARGEST_MISFIT = 0.1 * SURE
 It is far above the rounding errors of the poses of both robots, and far below what a wrong pose predicts.
 """
 
+STILL = 0.1 * LARGEST_MISFIT
+"""The distance in m from its place up to which a robot is there, in spite of rounding.
+
+With 0, a range from the end of a square would tell the heading, which it does not, and any heading would fit.
+"""
+
 KEPT = 64
 """The number of ticks within which the report of the tick of a range has to arrive."""
 
@@ -104,9 +110,8 @@ class Resected(msgspec.Struct, frozen=True):
 
 def _moved(state: RobotState, base: Pose, tick: int) -> Pose:
     """Return the pose of this robot at `tick` relative to `base`, both by dead reckoning."""
-    odometry = state.log.pose(ORIGIN, tick, state.config.mission.period)
-    # where it stands, rounding must not look like a motion
-    return compose(inverse(base), odometry) if odometry != base else ORIGIN
+    moved = compose(inverse(base), state.log.pose(ORIGIN, tick, state.config.mission.period))
+    return moved if math.hypot(moved.x, moved.y) > STILL else ORIGIN
 
 
 def _now(state: RobotState, found: Resected, base: Pose) -> Pose:
