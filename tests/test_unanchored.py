@@ -210,7 +210,7 @@ def test_lost_and_late_reports_only_cost_time(fault: dict[str, Any]) -> None:
 
 def test_a_range_from_where_a_square_ends_tells_no_heading() -> None:
     """The first report from after the square is of a tick in which the robot was back."""
-    faults = [{"delay": [5, 10]}, {}, {}, {}, {"corrupt": 0.4}, {"delay": [6, 10], "contact_ticks": [1, 31]}]
+    faults = [{"delay": [5, 10]}, {}, {}, {"corrupt": 0.4}, {"delay": [6, 10], "contact_ticks": [1, 31]}]
     group = {"robots": 4, "spacing": 6.930000000000001, "without_anchor": 1}
     table = {**scenario_table("random-group"), "seed": 201761783, "group": group, "fault": faults}
     run = of_frames(kept(scenario_of(table)))
