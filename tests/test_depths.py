@@ -19,6 +19,7 @@ from compose.recording.ranging.range_recording import FixedAnchor, RangeRecordin
 from docs.recorded_windows import is_wrong
 from tests.commands import refused, tandem
 from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
+from tests.range_tables import written_csv
 from tests.test_anchored import driven
 
 NOISY = Path(scenario.__file__).parent / "shipped" / "noisy.toml"
@@ -107,3 +108,25 @@ def test_a_mission_has_no_depths(tmp_path: Path, noise: str) -> None:
     path.write_text(noisy.replace("[mission.noise]", f"[mission.noise]\n{noise}"))
     what = "mission.noise.range_depth: only in recordings may ranges be depths, as of a camera"
     refused(tandem("run", path), what)
+
+
+@pytest.mark.parametrize("share", [0.0, 1.0])
+def test_tandem_estimate_says_that_ranges_are_depths(tmp_path: Path, share: float) -> None:
+    recording = seen(1, share=share)
+    (robot,), ranges = recording.robots, recording.ranges
+    names = ("t0", "t1", "dx", "dy", "dheading")
+    moves = np.column_stack((robot.odometry.t0, robot.odometry.t1, robot.odometry.increments)).tolist()
+    lengths = zip(ranges.t.tolist(), (ranges.second - 1).tolist(), ranges.range.tolist(), strict=True)
+    tables = {
+        "odometry": [{"robot": "A", **dict(zip(names, one, strict=True))} for one in moves],
+        "ranges": [
+            {"t": t, "from": "A", "to": LANDMARKS[k].id, "range": rho, "sigma": SIGMA}
+            for t, k, rho in lengths
+        ],
+        "anchors": [{"anchor": one.id, "x": one.x, "y": one.y} for one in LANDMARKS],
+    }
+    ended = tandem("estimate", written_csv(tmp_path / "seen", tables))
+    assert ended.status == 0
+    assert ("the ranges are depths along the headings, as of a camera: a share of" in ended.out) == (
+        share > 0.0
+    )

@@ -14,7 +14,12 @@ from agent.estimation.solver import Solver
 from compose.errors import BROKEN_PIPE, ENDED, NOT_LOCALISED, STOPPED_STATUS, UserError, writing
 from compose.extras import need
 from compose.launch.class_loader import solver_named
-from compose.recording.estimating.estimate_rows import PoseEstimateRow, RobotEstimate, estimate_csv
+from compose.recording.estimating.estimate_rows import (
+    EstimateSummary,
+    PoseEstimateRow,
+    RobotEstimate,
+    estimate_csv,
+)
 from compose.recording.estimating.estimate_run import RecordingEstimate, StreamEstimate, estimated
 from compose.recording.estimating.estimate_summary import write_estimate
 from compose.recording.estimating.noise_files import told_noise
@@ -30,6 +35,9 @@ from compose.terminal.tables import shown
 from compose.terminal.text_width import tell
 from compose.view.epochs import write_player
 from protocol.output import discard, say
+
+DEPTH_SIGMAS = 4.0
+"""The sigmas by which the share of ranges that is a depth must differ from 0 to be told."""
 
 
 def main(options: argparse.Namespace) -> int:
@@ -139,6 +147,7 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
     found.append(
         f"noise: {summary.noise}; last pose in m and rad; time from the first odometry of {every} on"
     )
+    found += _depths(summary)
     if summary.relative_to is not None:
         found.append(f"poses are in the frame of that of {summary.relative_to} at the beginning")
     for name, anchor in summary.anchors.items():
@@ -164,6 +173,14 @@ def _lines(problem: Measurements, estimate: RecordingEstimate) -> list[str]:
             after = f"{one.withdrawn_s - summary.begin_s:.1f}"
             found.append(f"{name}: the claim is withdrawn after {after} s, and the last pose is no claim")
     return found
+
+
+def _depths(summary: EstimateSummary) -> Iterator[str]:
+    """Yield a sentence about ranges that are depths."""
+    depth = summary.calibration.range_depth if summary.calibration is not None else None
+    if depth is not None and depth.value > DEPTH_SIGMAS * depth.sigma:
+        share = f"a share of {depth.value:.2f} with a sigma of {depth.sigma:.2f}"
+        yield f"the ranges are depths along the headings, as of a camera: {share}"
 
 
 def _about(name: str, one: RobotEstimate) -> Iterator[str]:
