@@ -7,7 +7,7 @@ import math
 import msgspec
 import numpy as np
 
-from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, JointRanges, range_errors
 from agent.estimation.gaussian.odometry_noise import (
     Array,
     Places,
@@ -30,9 +30,6 @@ gains more with each of them. Ranges as told, of 0.05 m and 300 from each robot 
 evidence of 16 for the profile `uwb`, whose scale shrank them by a quarter; with 500, it was 102. By predicted
 ranges, it is -11 to -12 with any number. Up to 200 ranges it differs by 2, which decides nothing.
 """
-
-SCALE_AFTER_BIAS = 1
-"""The column of the scale error in `Ranges.common_errors` if there is a bias of all ranges."""
 
 
 class Problem(msgspec.Struct, frozen=True, eq=False):
@@ -78,6 +75,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
         holding, common = radio < 0, ranges.common_errors(priors)[rows]
         common[holding] = 0.0
         radios = ranges.radios
+        column = {name: number for number, name in enumerate(range_errors(priors, len(radios)))}
         if radios != list(range(len(radios))):
             radio = np.where(holding, -1, np.searchsorted(radios, radio))  # without gaps
         v, omega, slip = _velocities(measured.paths, ticks)
@@ -101,10 +99,10 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             place=ranges.place[rows],
             rho=rho,
             common=common,
-            scaled=-1 if not priors.range_scale or few else SCALE_AFTER_BIAS * bool(priors.range_bias),
+            scaled=-1 if few else column.get("range_scale", -1),
             scale=priors.range_scale,
-            delayed=common.shape[1] - 1 - bool(priors.range_depth) if priors.range_delay else -1,
-            deep=common.shape[1] - 1 if priors.range_depth else -1,
+            delayed=column.get("range_delay", -1),
+            deep=column.get("range_depth", -1),
             eye=np.where(ranges.by_second & (ranges.second >= 0), ranges.second, ranges.first)[rows],
             anchor=anchor[rows],
             anchors=anchors,

@@ -51,6 +51,15 @@ less, 16 robots that all range each other would use fewer than 8 ranges of each 
 """
 
 
+def range_errors(priors: Priors, pairs: int) -> list[str]:
+    """Return the names in `priors` of the constant errors of ranges, in the order of a fit's unknowns.
+
+    Each of the `pairs` of radios has a bias of its own. The errors of the odometry follow.
+    """
+    counts = {"range_bias": 1, "range_scale": 1, "pair_bias": pairs, "range_delay": 1, "range_depth": 1}
+    return [name for name, count in counts.items() if getattr(priors, name) for _ in range(count)]
+
+
 class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     """N ranges: those of each robot to its anchors, and then those between robots."""
 
@@ -71,7 +80,10 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     -1 for a range that has no error but a white one, and is no outlier.
     """
     by_second: NDArray[np.bool]
-    """True if the second one has measured the range; a depth is along the heading of who has; shape (N,)."""
+    """True if the second end has measured the range, not the first; shape (N,).
+
+    A depth is along the heading of the robot that has measured it.
+    """
 
     @cached_property
     def radios(self) -> list[int]:
@@ -95,26 +107,22 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
         return found
 
     def common_errors(self, priors: Priors) -> Array:
-        """Return the effect (m) of one sigma of each constant error on the ranges; shape (N, m).
+        """Return the effect (m) of one sigma of each of the `range_errors` on the ranges; shape (N, c).
 
-        The errors are a bias of all ranges, a scale, a bias of each pair of radios, a delay, and the share of
-        ranges that is a depth. The scale multiplies the measured ranges: then the effects are the same under
-        each guess. Those of the delay, whose column is in s, and of the depth follow from the poses (see
-        `smoother`).
+        The scale multiplies the measured ranges: then its effects are the same under each guess. The effects
+        of a delay and of the share of depth depend on the poses (see `smoother`): their columns are the
+        sigmas in s and as a fraction, 0 for a range that has no such error.
         """
-        rho, radios = self.rho, self.radios if priors.pair_bias else []
-        last = [one for one in (priors.range_delay, priors.range_depth) if one]
-        size = bool(priors.range_bias) + bool(priors.range_scale) + len(radios) + len(last)
-        found, column = np.empty((len(rho), size)), 0
-        if priors.range_bias:
-            found[:, column], column = priors.range_bias, column + 1
+        names = range_errors(priors, len(self.radios))
+        found = np.tile([float(getattr(priors, name)) for name in names], (len(self.rho), 1))
         if priors.range_scale:
-            found[:, column], column = priors.range_scale * rho, column + 1
-        if radios:
-            found[:, column : column + len(radios)] = priors.pair_bias * (self.radio[:, None] == radios)
-        found[:, size - len(last) :] = last
+            found[:, names.index("range_scale")] *= self.rho
+        if "pair_bias" in names:
+            begin = names.index("pair_bias")
+            found[:, begin : begin + len(self.radios)] *= self.radio[:, None] == self.radios
         if priors.range_depth:
-            found[self.by_second & (self.second < 0), -1] = 0.0  # the beacon has measured
+            # a located robot that counts as an anchor has measured: its heading is not in this fit
+            found[self.by_second & (self.second < 0), names.index("range_depth")] = 0.0
         return found
 
     def rows(self, some: NDArray[np.bool] | Places) -> JointRanges:
@@ -299,7 +307,7 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
 
     @property
     def loosened(self) -> Array:
-        """The variance (m^2) that constant and slow errors add to each range; shape (N,)."""
+        """The variance (m^2) that constant and slow errors add to each range, but for depths; shape (N,)."""
         priors, ranges = self.noise.priors, self.ranges
         of_biases = priors.range_bias**2 + priors.pair_bias**2 + priors.slow_sigma**2
         variance: Array = np.square(priors.range_scale * ranges.rho) + of_biases

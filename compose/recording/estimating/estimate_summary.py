@@ -12,7 +12,7 @@ import numpy as np
 from agent.estimation.fit import Fit
 from agent.estimation.following import ClaimRule
 from agent.estimation.gaussian.joint_claims import Displacement, displaced_anchor, displacements
-from agent.estimation.gaussian.joint_ranges import JointMeasurements
+from agent.estimation.gaussian.joint_ranges import JointMeasurements, range_errors
 from agent.estimation.gaussian.noise_level import INLIER
 from compose.recording.estimating.estimate_rows import (
     EstimatedAnchor,
@@ -111,11 +111,12 @@ def learned_errors(fitted: EpochFit | None, pairs: Sequence[str]) -> LearnedErro
         mean, sigma = next(constants)
         return LearnedError(prior * mean, prior * sigma)
 
-    bias = next_of(priors.range_bias) if priors.range_bias else None
-    scale = next_of(priors.range_scale) if priors.range_scale else None
-    of_pairs = {name: next_of(priors.pair_bias) for name in pairs if priors.pair_bias}
-    delay = next_of(priors.range_delay) if priors.range_delay else None
-    depth = next_of(priors.range_depth) if priors.range_depth else None
+    learned: dict[str, list[LearnedError]] = {}
+    for name in range_errors(priors, len(pairs)):
+        learned.setdefault(name, []).append(next_of(getattr(priors, name)))
+    alike = ("range_bias", "range_scale", "range_delay", "range_depth")
+    bias, scale, delay, depth = [learned[name][0] if name in learned else None for name in alike]
+    of_pairs = dict(zip(pairs, learned.get("pair_bias", ()), strict=False))
     odometry = (priors.wheel_scale, priors.wheel_scale, priors.gyro_bias)
     own = {name: [next_of(prior) for prior in odometry] for name in names if priors.of_odometry}
     wheels, turns, gyros = [{name: each[k] for name, each in own.items()} for k in range(3)]
