@@ -322,7 +322,7 @@ class DeadReckoning:
     def __init__(self, problem: Problem) -> None:
         self.problem, self.ranges = problem, problem.measured.ranges
         self.priors = problem.measured.noise.priors
-        self.common = self.ranges.common_errors(self.priors._replace(range_delay=0.0))
+        self.common = self.ranges.common_errors(self.priors._replace(range_delay=0.0, range_depth=0.0))
         self.sigma = np.sqrt(np.square(self.ranges.sigma) + self.priors.slow_sigma**2)
         self.count = len(problem.robots)
 
