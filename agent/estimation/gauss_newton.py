@@ -64,11 +64,12 @@ DESCENT = 1e-6
 SETTLED_WEIGHT = 1e-2
 """The change of a weight below which the weights have converged."""
 
-TURNED = 0.5
-"""The factor by which a weight takes less of its changes from each one on that turns, after two steps.
+DAMPING = 0.5
+"""The factor of all further changes of a weight whenever its change has the other sign than the last one.
 
-With 1, weights of ranges that are as probably outliers as not go to and fro for ever, and the fit with them.
-The first two steps are long: weights that turn there would keep a part of what they were.
+With 1, the weight of a range that may as well be an outlier alternates for ever, and the fit with it. With
+less, a weight comes to rest before it is right, and the fit does not converge. It does not apply to the first
+two changes: the steps are long there, and a weight would keep a part of what it was far from the solution.
 """
 
 RIDGE = 1e-12
@@ -229,7 +230,7 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
         weight, _ = weights_by_errors(at.walk.residual.tolist(), [math.sqrt(one) for one in loose], by)
     else:
         weight = weights.tolist()
-    last, share = [0.0] * len(weight), [1.0] * len(weight)
+    changed, damping = [0.0] * len(weight), [1.0] * len(weight)
     for number in range(until.steps + 1):
         variance = [one + least for one in weighted_variance(by, weight)]
         taken = _step(of, by, at, variance)
@@ -254,10 +255,10 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
             return _ended(of, by, at, after, taken, weight, variance, sound, expected)
         for j, new in enumerate(updated):
             change = new - weight[j]
-            if number > 1 and change * last[j] < 0.0:
-                share[j] *= TURNED
-            last[j] = change
-            weight[j] += share[j] * change
+            if number > 1 and change * changed[j] < 0.0:
+                damping[j] *= DAMPING
+            changed[j] = change
+            weight[j] += damping[j] * change
         sound, before = sounder, length
         of, at = _weighed(told, sound, after)
     raise AssertionError("the last step returns")

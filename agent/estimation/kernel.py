@@ -24,7 +24,7 @@ class _Measured(ctypes.Structure):
         *[(name, ctypes.c_double) for name in ("period", "survey", "slow", "decay", "scale")],
         *[(name, Pointer) for name in ("v", "omega", "slip", "white", "stray", "patterns", "place", "rho")],
         *[(name, Pointer) for name in ("effects", "mean", "information", "pivot")],
-        *[(name, Pointer) for name in ("begin", "first", "second", "eye", "anchor", "radio")],
+        *[(name, Pointer) for name in ("begin", "first", "second", "observer", "anchor", "radio")],
     ]
 
 
@@ -56,7 +56,7 @@ class Kernel:
             *(of.v, of.omega, of.slip, of.white, of.stray, of.patterns, of.place, of.rho, of.common),
             *(of.mean, of.information, of.pivot, by.sigma),
         )
-        numbers = (of.begin, of.first, of.second, of.eye, of.anchor, of.radio, by.holding, by.by_radio)
+        numbers = (of.begin, of.first, of.second, of.observer, of.anchor, of.radio, by.holding, by.by_radio)
         self._floats, self._numbers = np.concatenate([one.ravel() for one in floats]), np.concatenate(numbers)
         measured = _Measured(
             *(n, k, count, c, m, of.anchors, of.radios, of.scaled, of.delayed, of.deep, of.strays),
@@ -83,10 +83,10 @@ class Kernel:
         """Return how to build the kernel again from a copy, which has memory of its own."""
         return Kernel, (self.of, self.by)
 
-    def walked(self, poses: Array, constants: Array, white: Array, deep: float = 0.0) -> Walk:
+    def walked(self, poses: Array, constants: Array, white: Array, depth: float = 0.0) -> Walk:
         """Return the paths; see `smoother.walked`."""
         arrays, memory = self._part(WALK, WALK + len(Walk._fields))
-        given = *map(address, (poses, constants, white)), ctypes.c_double(deep), address(memory)
+        given = *map(address, (poses, constants, white)), ctypes.c_double(depth), address(memory)
         library().paths(self._measured, *given)
         return Walk._make(arrays)
 

@@ -103,7 +103,7 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             scale=priors.range_scale,
             delayed=column.get("range_delay", -1),
             deep=column.get("range_depth", -1),
-            eye=np.where(ranges.by_second & (ranges.second >= 0), ranges.second, ranges.first)[rows],
+            observer=np.where(ranges.by_second & (ranges.second >= 0), ranges.second, ranges.first)[rows],
             anchor=anchor[rows],
             anchors=anchors,
             survey=priors.survey_error,

@@ -42,7 +42,7 @@ const char *compiler(void)
 #define LARGEST_STEP 0.3
 #define DESCENT 1e-6
 #define SETTLED_WEIGHT 1e-2
-#define TURNED 0.5
+#define DAMPING 0.5
 #define RIDGE 1e-12
 #define GRAIN 1e-12
 #define LEAST_VARIANCE 1e-300
@@ -69,12 +69,12 @@ typedef struct {
     double period, survey, slow, decay, scale;
     const double *v, *omega, *slip, *white, *stray, *patterns, *place, *rho, *effects, *mean, *information;
     const double *pivot;
-    const Index *begin, *first, *second, *eye, *anchor, *radio;
+    const Index *begin, *first, *second, *observer, *anchor, *radio;
 } Measured;
 
 /* smoother.Walk */
 typedef struct {
-    double *place, *moves, *direction, *residual, *rate, *turn, *ahead;
+    double *place, *moves, *direction, *residual, *rate, *by_heading, *to_depth;
 } Walk;
 
 /* smoother.Passed and smoother.Adjoint; `row_of` has the places and derivatives of a range. Those from
@@ -84,7 +84,7 @@ typedef struct {
     double *innovation, *variance, *effects, *gain, *state, *u, *p, *information, *gradient;
     double *misfit, *of_limited, *adjoint, *adjoint_limited, *by_unknowns, *weight, *weighted, *effect;
     double *lower, *whitening, *inner, *vector, *other;
-    double *updated, *last, *share, *errors, *spread, *ratios, *shorter, *sound, *noise;
+    double *updated, *changed, *damping, *errors, *spread, *ratios, *shorter, *sound, *noise;
 } Work;
 
 /* smoother.Step */
@@ -241,10 +241,11 @@ static void velocity_of(const Measured *of, const Walk *walk, Index i, Index k, 
     by[1] = v * sin(course);
 }
 
-/* The direction, the residual, the rate, and what makes a depth of range `j`, at tick `k`. */
-static void predict(const Measured *of, double deep, Index j, Index k, Walk *to)
+/* Sets direction, residual, rate, by_heading and to_depth of range `j`, at tick `k`. */
+static void predict(const Measured *of, double depth, Index j, Index k, Walk *to)
 {
-    const Index ticks = of->ticks + 1, first = of->first[j], second = of->second[j], eye = of->eye[j];
+    const Index ticks = of->ticks + 1, first = of->first[j], second = of->second[j];
+    const Index observer = of->observer[j];
     const double *at = to->place + 3 * (first * ticks + k), *other = of->place + 2 * j;
     if (second >= 0) other = to->place + 3 * (second * ticks + k);
     const double dx = at[0] - other[0], dy = at[1] - other[1];
@@ -252,16 +253,16 @@ static void predict(const Measured *of, double deep, Index j, Index k, Walk *to)
     if (distance < SMALLEST_DISTANCE) distance = SMALLEST_DISTANCE;
     double x = dx / distance, y = dy / distance;
     to->residual[j] = of->rho[j] - distance;
-    to->rate[j] = to->turn[j] = to->ahead[j] = 0.0;
+    to->rate[j] = to->by_heading[j] = to->to_depth[j] = 0.0;
     if (of->deep >= 0) {
-        const double share = deep * of->effects[j * of->common + of->deep];
-        const double heading = to->place[3 * (eye * ticks + k) + 2];
-        const double away = eye == second ? 1.0 : -1.0, unit = 1.0 - share;
-        const double c = away * cos(heading), s = away * sin(heading);
-        to->ahead[j] = dx * c + dy * s - distance;
-        to->turn[j] = share * (dy * c - dx * s);
-        x = unit * x + share * c;
-        y = unit * y + share * s;
+        const double share = depth * of->effects[j * of->common + of->deep];
+        const double heading = to->place[3 * (observer * ticks + k) + 2];
+        const double sign = observer == second ? 1.0 : -1.0, rest = 1.0 - share;
+        const double c = sign * cos(heading), s = sign * sin(heading);
+        to->to_depth[j] = dx * c + dy * s - distance;
+        to->by_heading[j] = share * (dy * c - dx * s);
+        x = rest * x + share * c;
+        y = rest * y + share * s;
     }
     to->direction[2 * j] = x;
     to->direction[2 * j + 1] = y;
@@ -273,14 +274,15 @@ static void predict(const Measured *of, double deep, Index j, Index k, Walk *to)
             by[0] -= of_other[0];
             by[1] -= of_other[1];
         }
-        const Index before = eye * of->ticks + k - 1;
-        const double turned = of->omega[before] + to->moves[8 * before + 7];
-        to->rate[j] = x * by[0] + y * by[1] + to->turn[j] * turned;
+        const Index before = observer * of->ticks + k - 1;
+        const double omega = of->omega[before] + to->moves[8 * before + 7];
+        to->rate[j] = x * by[0] + y * by[1] + to->by_heading[j] * omega;
     }
 }
 
 static void walked(
-    const Measured *of, const double *poses, const double *constants, const double *white, double deep, Walk *to)
+    const Measured *of, const double *poses, const double *constants, const double *white, double depth,
+    Walk *to)
 {
     const Index K = of->ticks, m = of->constant;
     for (Index i = 0; i < of->robots; i++) {
@@ -316,7 +318,7 @@ static void walked(
         }
     }
     for (Index k = 0; k <= K; k++)
-        for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) predict(of, deep, j, k, to);
+        for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) predict(of, depth, j, k, to);
 }
 
 /* The derivatives of the start pose of robot `i` with respect to its unknowns. */
@@ -381,8 +383,8 @@ SIZED Row row_of(const Measured *of, const Walk *walk, Index j)
     const double x = walk->direction[2 * j], y = walk->direction[2 * j + 1];
     Row row = {{3 * of->first[j], 3 * of->first[j] + 1}, {x, y}, 2};
     if (of->deep >= 0) {
-        row.at[2] = 3 * of->eye[j] + 2;
-        row.by[2] = walk->turn[j];
+        row.at[2] = 3 * of->observer[j] + 2;
+        row.by[2] = walk->by_heading[j];
         row.count = 3;
     }
     if (of->second[j] >= 0) {
@@ -404,7 +406,7 @@ SIZED double effect_of(const Measured *of, const Walk *walk, Index j, Index e)
 {
     const double told = of->effects[j * of->common + e];
     if (e == of->delayed) return -told * walk->rate[j];
-    if (e == of->deep) return told * walk->ahead[j];
+    if (e == of->deep) return told * walk->to_depth[j];
     return e == of->scaled && told != 0.0 ? of->scale * (of->rho[j] - walk->residual[j]) : told;
 }
 
@@ -1131,7 +1133,7 @@ static int converged(
     least = by->noisy ? GRAIN * least : 0.0;
     if (!weighed)
         weights_by_errors(by, of->ranges, to->points->walk.residual, w->spread, w->ratios, to->weights);
-    for (Index j = 0; j < of->ranges; j++) w->last[j] = 0.0, w->share[j] = 1.0;
+    for (Index j = 0; j < of->ranges; j++) w->changed[j] = 0.0, w->damping[j] = 1.0;
     for (Index number = 0; number <= until->steps; number++) {
         const Point *here = to->points + at;
         weighted_variance(of, by, to->weights, to->variance);
@@ -1161,9 +1163,9 @@ static int converged(
         }
         for (Index j = 0; j < of->ranges; j++) {
             const double change = w->updated[j] - to->weights[j];
-            if (number > 1 && change * w->last[j] < 0.0) w->share[j] *= TURNED;
-            w->last[j] = change;
-            to->weights[j] += w->share[j] * change;
+            if (number > 1 && change * w->changed[j] < 0.0) w->damping[j] *= DAMPING;
+            w->changed[j] = change;
+            to->weights[j] += w->damping[j] * change;
         }
         before = length;
         at = after;
@@ -1266,8 +1268,8 @@ void prepared(Measured *of, Weighing *by, const double *floats, const Index *num
     of->begin = numbers;
     of->first = of->begin + K + 2;
     of->second = of->first + N;
-    of->eye = of->second + N;
-    of->anchor = of->eye + N;
+    of->observer = of->second + N;
+    of->anchor = of->observer + N;
     of->radio = of->anchor + N;
     by->holding = of->radio + N;
     by->by_radio = by->holding + N;
@@ -1277,13 +1279,14 @@ void prepared(Measured *of, Weighing *by, const double *floats, const Index *num
 
 /* The paths, in the order of Walk. */
 void paths(
-    const Measured *of, const double *poses, const double *constants, const double *white, double deep, double *to)
+    const Measured *of, const double *poses, const double *constants, const double *white, double depth,
+    double *to)
 {
     Index sizes[ARRAYS];
     Walk walk;
     sizes_of(of, sizes);
     placed((double **)&walk, to, sizes + 6, 7);
-    walked(of, poses, constants, white, deep, &walk);
+    walked(of, poses, constants, white, depth, &walk);
 }
 
 /* A step; returns 0 if the information of the unknowns is not positive definite, and -2 without memory. */

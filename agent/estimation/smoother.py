@@ -75,11 +75,11 @@ class Measured(NamedTuple):
     scale: float
     """its effect on a range of 1 m"""
     delayed: int
-    """the one of them that is a delay, whose `common` is in s, and 0 where there is none; -1: none"""
+    """the one of them that is a delay, whose `common` is its sigma in s, 0 where there is none; -1: none"""
     deep: int
-    """the one of them that makes ranges depths, whose `common` is a share; -1: none"""
-    eye: Places
-    """the robot that has measured each range; a depth is along its heading; (N,)"""
+    """the one of them that is the share of depth, whose `common` is its sigma, 0 where none; -1: none"""
+    observer: Places
+    """the robot that has measured each range: a depth is along its heading; (N,)"""
     anchor: Places
     """the anchor of each range, among those that are not surveyed exactly; -1 for any other; (N,)"""
     anchors: int
@@ -131,15 +131,15 @@ class Walk(NamedTuple):
     """displacement of each tick per unit of v, the displacement, its derivative with respect to omega, and
     the errors of v and omega; (n, K, 8)"""
     direction: Array
-    """derivatives of the ranges by the place of the first robot: unit vectors but for depths; (N, 2)"""
+    """derivatives of the ranges by the position of the first robot; without depth unit vectors; (N, 2)"""
     residual: Array
-    """measured minus predicted ranges in m; (N,)"""
+    """measured ranges minus distances in m; (N,)"""
     rate: Array
     """range rates in m/s, at the end of the tick before; 0 at tick 0, and without a delay; (N,)"""
-    turn: Array
-    """derivatives of the ranges by the heading of who has measured, in m; 0 but for depths; (N,)"""
-    ahead: Array
-    """depths along that heading minus distances, in m; 0 if ranges are no depths; (N,)"""
+    by_heading: Array
+    """derivatives of the ranges by the heading of their observer in m; without depth 0; (N,)"""
+    to_depth: Array
+    """depths along that heading minus distances in m; 0 if no range may be a depth; (N,)"""
 
 
 class FitStep(NamedTuple):
@@ -183,14 +183,14 @@ class Singular(ArithmeticError):
     """The information of the unknowns is not positive definite."""
 
 
-def walked(of: Measured, poses: Array, constants: Array, white: Array, deep: float = 0.0) -> Walk:
+def walked(of: Measured, poses: Array, constants: Array, white: Array, depth: float = 0.0) -> Walk:
     """Return the paths from start `poses`, (3 n,), with constant and white errors, (n, m) and (n, 2, K).
 
-    `deep` is the error in sigmas that makes ranges depths.
+    `depth` is the share of depth in sigmas: it changes the derivatives of the ranges, not their residuals.
     """
     place, moves = _driven(of, poses, constants, white)
     ranges = [(j, k) for k in range(of.ticks + 1) for j in range(of.begin[k], of.begin[k + 1])]
-    rows = np.array([_predicted(of, place, moves, j, k, deep) for j, k in ranges]).reshape(-1, 6)
+    rows = np.array([_predicted(of, place, moves, j, k, depth) for j, k in ranges]).reshape(-1, 6)
     moved = np.array(moves).reshape(of.robots, of.ticks, 8)
     return Walk(np.array(place), moved, rows[:, :2], *np.ascontiguousarray(rows[:, 2:].T))
 
@@ -224,29 +224,31 @@ def _driven(of: Measured, poses: Array, constants: Array, white: Array) -> tuple
     return place, moves
 
 
-def _predicted(of: Measured, place: list[Matrix], moves: list[Matrix], j: int, k: int, deep: float) -> Vector:
-    """Return direction, residual, rate, turn and ahead of range `j`, at tick `k` (see Walk)."""
+def _predicted(
+    of: Measured, place: list[Matrix], moves: list[Matrix], j: int, k: int, depth: float
+) -> Vector:
+    """Return direction, residual, rate, by_heading and to_depth of range `j`, at tick `k` (see Walk)."""
     at, other = place[of.first[j]][k], of.place[j]
     if of.second[j] >= 0:
         other = place[of.second[j]][k]
     dx, dy = at[0] - other[0], at[1] - other[1]
     distance = max(math.sqrt(dx * dx + dy * dy), SMALLEST_DISTANCE)
-    x, y, rate, turn, ahead = dx / distance, dy / distance, 0.0, 0.0, 0.0
+    x, y, rate, by_heading, to_depth = dx / distance, dy / distance, 0.0, 0.0, 0.0
     if of.deep >= 0:
-        share, heading = deep * of.common[j, of.deep], place[of.eye[j]][k][2]
-        away, unit = 1.0 if of.eye[j] == of.second[j] else -1.0, 1.0 - share
-        c, s = away * math.cos(heading), away * math.sin(heading)
-        ahead = dx * c + dy * s - distance
-        turn = share * (dy * c - dx * s)
-        x, y = unit * x + share * c, unit * y + share * s
+        share, heading = depth * of.common[j, of.deep], place[of.observer[j]][k][2]
+        sign, rest = 1.0 if of.observer[j] == of.second[j] else -1.0, 1.0 - share
+        c, s = sign * math.cos(heading), sign * math.sin(heading)
+        to_depth = dx * c + dy * s - distance
+        by_heading = share * (dy * c - dx * s)
+        x, y = rest * x + share * c, rest * y + share * s
     if of.delayed >= 0 and k > 0:
         vx, vy = _velocity(of, place, moves, of.first[j], k)
         if of.second[j] >= 0:
             other_vx, other_vy = _velocity(of, place, moves, of.second[j], k)
             vx, vy = vx - other_vx, vy - other_vy
-        turned = of.omega[of.eye[j], k - 1] + moves[of.eye[j]][k - 1][7]
-        rate = x * vx + y * vy + turn * turned
-    return [x, y, of.rho[j] - distance, rate, turn, ahead]
+        omega = of.omega[of.observer[j], k - 1] + moves[of.observer[j]][k - 1][7]
+        rate = x * vx + y * vy + by_heading * omega
+    return [x, y, of.rho[j] - distance, rate, by_heading, to_depth]
 
 
 def _velocity(of: Measured, place: list[Matrix], moves: list[Matrix], i: int, k: int) -> tuple[float, float]:
@@ -377,7 +379,7 @@ def _row(of: Measured, walk: Walk, j: int) -> list[tuple[int, float]]:
     x, y = walk.direction[j].tolist()
     row = [(3 * of.first[j], x), (3 * of.first[j] + 1, y)]
     if of.deep >= 0:
-        row.append((3 * of.eye[j] + 2, float(walk.turn[j])))
+        row.append((3 * of.observer[j] + 2, float(walk.by_heading[j])))
     if of.second[j] >= 0:
         row += [(3 * of.second[j], -x), (3 * of.second[j] + 1, -y)]
     if of.radios and of.radio[j] >= 0:
@@ -391,7 +393,7 @@ def effect_of(of: Measured, walk: Walk, j: int, e: int) -> float:
     if e == of.delayed:
         return -told * float(walk.rate[j])
     if e == of.deep:
-        return told * float(walk.ahead[j])
+        return told * float(walk.to_depth[j])
     if e == of.scaled and told != 0.0:
         return of.scale * float(of.rho[j] - walk.residual[j])
     return told
