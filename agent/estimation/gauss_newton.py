@@ -64,12 +64,11 @@ DESCENT = 1e-6
 SETTLED_WEIGHT = 1e-2
 """The change of a weight below which the weights have converged."""
 
-DAMPING = 0.5
+WEIGHT_DAMPING = 0.5
 """The factor of all further changes of a weight whenever its change has the other sign than the last one.
 
 With 1, the weight of a range that may as well be an outlier alternates for ever, and the fit with it. With
-less, a weight comes to rest before it is right, and the fit does not converge. It does not apply to the first
-two changes: the steps are long there, and a weight would keep a part of what it was far from the solution.
+less, weights come to rest before they are right. The first two changes, of long steps, are whole ones.
 """
 
 RIDGE = 1e-12
@@ -256,7 +255,7 @@ def fitted(of: Measured, by: Weighing, begun: Point, weights: Array | None, unti
         for j, new in enumerate(updated):
             change = new - weight[j]
             if number > 1 and change * changed[j] < 0.0:
-                damping[j] *= DAMPING
+                damping[j] *= WEIGHT_DAMPING
             changed[j] = change
             weight[j] += damping[j] * change
         sound, before = sounder, length

@@ -42,7 +42,7 @@ const char *compiler(void)
 #define LARGEST_STEP 0.3
 #define DESCENT 1e-6
 #define SETTLED_WEIGHT 1e-2
-#define DAMPING 0.5
+#define WEIGHT_DAMPING 0.5
 #define RIDGE 1e-12
 #define GRAIN 1e-12
 #define LEAST_VARIANCE 1e-300
@@ -1163,7 +1163,7 @@ static int converged(
         }
         for (Index j = 0; j < of->ranges; j++) {
             const double change = w->updated[j] - to->weights[j];
-            if (number > 1 && change * w->changed[j] < 0.0) w->damping[j] *= DAMPING;
+            if (number > 1 && change * w->changed[j] < 0.0) w->damping[j] *= WEIGHT_DAMPING;
             w->changed[j] = change;
             to->weights[j] += w->damping[j] * change;
         }
