@@ -110,7 +110,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     odometry: VelocityNoise = VelocityNoise()
     """The difference between executed and measured velocities."""
     profile: ProfileName | None = None
-    """The profile whose values hold for all fields that the scenario does not set."""
+    """The profile whose values hold for all fields that are not set; `camera` is for recordings only."""
     range_bias: Sigma | None = None
     """The prior of a bias that all ranges have in common, in m."""
     pair_bias: Sigma | None = None
@@ -132,7 +132,7 @@ class Noise(msgspec.Struct, frozen=True, forbid_unknown_fields=True, dict=True):
     range_delay: Delay = 0.0
     """The prior of the delay in s of all ranges: of their stamps after the time of the measurement."""
     range_depth: Fraction = 0.0
-    """The prior of the share of ranges that is a depth, along the heading of who measured; for recordings."""
+    """The prior of the share of depth in all ranges, 1 for those of a camera; for recordings only."""
     strays: Probability = 1e-3
     """The probability that a range has an error of any size and sign; without noise, there are none."""
     odometry_strays: Probability = 0.0

@@ -34,7 +34,7 @@ class MeasuredRange(NamedTuple):
     sigma: float
     """The standard deviation of the range in m."""
     by_second: bool = False
-    """True if the robot with the larger name has measured it."""
+    """True if the second robot of its key has measured it, whose name is the larger one; else the first."""
 
 
 class AnchorPlace(NamedTuple):

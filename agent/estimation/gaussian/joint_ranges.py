@@ -52,10 +52,7 @@ less, 16 robots that all range each other would use fewer than 8 ranges of each 
 
 
 def range_errors(priors: Priors, pairs: int) -> list[str]:
-    """Return the names in `priors` of the constant errors of ranges, in the order of a fit's unknowns.
-
-    Each of the `pairs` of radios has a bias of its own. The errors of the odometry follow.
-    """
+    """Return the name in `priors` of each constant error of ranges, in the order of a fit of `pairs`."""
     counts = {"range_bias": 1, "range_scale": 1, "pair_bias": pairs, "range_delay": 1, "range_depth": 1}
     return [name for name, count in counts.items() if getattr(priors, name) for _ in range(count)]
 
@@ -80,10 +77,7 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
     -1 for a range that has no error but a white one, and is no outlier.
     """
     by_second: NDArray[np.bool]
-    """True if the second end has measured the range, not the first; shape (N,).
-
-    A depth is along the heading of the robot that has measured it.
-    """
+    """True if the second end has measured the range: a depth is along its heading; shape (N,)."""
 
     @cached_property
     def radios(self) -> list[int]:
@@ -121,8 +115,7 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
             begin = names.index("pair_bias")
             found[:, begin : begin + len(self.radios)] *= self.radio[:, None] == self.radios
         if priors.range_depth:
-            # a located robot that counts as an anchor has measured: its heading is not in this fit
-            found[self.by_second & (self.second < 0), names.index("range_depth")] = 0.0
+            found[self.by_second & (self.second < 0), names.index("range_depth")] = 0.0  # the beacon measured
         return found
 
     def rows(self, some: NDArray[np.bool] | Places) -> JointRanges:

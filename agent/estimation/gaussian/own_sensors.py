@@ -111,9 +111,9 @@ def doubt(own: JointMeasurements, pair: JointMeasurements | None = None, robot: 
 def contradiction(fitted: Fit, measured: JointMeasurements, *, recorded: bool = False) -> Doubt | None:
     """Return the profile that explains what was `measured` much better than the told noise.
 
-    `fitted` is the fit that would be claimed; what was `recorded` may be of cameras. Only constant errors
-    are compared: slow ones and strays do not move a pose by more than the noise level that robots learn.
-    Biases are in proportion to the sigma.
+    `fitted` is the fit that would be claimed. Ranges that were `recorded` may be those of a camera, those of
+    a mission are not. Only constant errors are compared: slow ones and strays do not move a pose by more than
+    the noise level that robots learn. Biases are in proportion to the sigma.
     """
     noise = measured.noise
     others, size = {}, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA

@@ -303,10 +303,9 @@ def among_beacons(
             place[own] = one.fit.places(k, ranges.tick[own]).T
             spread = one.fit.covariance[3 * k : 3 * k + 2, 3 * k : 3 * k + 2]
             variance[own] += min(0.5 * float(np.trace(spread)), measured.reach**2)
-    first = np.zeros(len(place), np.intp)
     by_second = ranges.by_second ^ (ranges.second == robot)
-    told = {"sigma": np.sqrt(variance), "first": first, "second": first - 1, "by_second": by_second}
-    ranges = replace(ranges, place=place, **told)
+    ends = {"first": np.zeros_like(ranges.first), "second": np.full_like(ranges.second, -1)}
+    ranges = replace(ranges, sigma=np.sqrt(variance), place=place, by_second=by_second, **ends)
     path = measured.paths[robot]
     return replace(measured, robots=("",), paths=(path,), ranges=ranges, prior=None, surveyed=(), silent=())
 

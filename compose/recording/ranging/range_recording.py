@@ -93,7 +93,7 @@ class RangeSeries(NamedTuple):
     t: Numbers
     """The times in s; shape (N,)."""
     first: Places
-    """The index of the robot that ranged, in `RangeRecording.radios`; shape (N,)."""
+    """The index in `RangeRecording.radios` of the robot that measured, or to which an anchor did; (N,)."""
     second: Places
     """The index of the other robot or the anchor, in `RangeRecording.radios`; shape (N,)."""
     range: Numbers

@@ -65,11 +65,11 @@ class RangeRow(Row, frozen=True):
     t: Stamp
     """The time of the measurement in s."""
     first: RobotId = msgspec.field(name="from")
-    """The robot that ranged, or an anchor."""
+    """The robot that measured: a depth is along its heading. An anchor here counts as one in `to`."""
     second: RobotId = msgspec.field(name="to")
     """The other robot or the anchor. At least one of the two is a robot."""
     range: Range
-    """The measured distance in m."""
+    """The measured distance in m, or depth of a camera."""
     sigma: StatedSigma | None = None
     """The standard deviation in m."""
 
