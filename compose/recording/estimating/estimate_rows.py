@@ -151,7 +151,7 @@ class LearnedErrors(msgspec.Struct, frozen=True):
     range_delay_s: LearnedError | None
     """The delay of all ranges in s: the time by which their stamps are late."""
     range_depth: LearnedError | None
-    """The share of all ranges that is a depth: 1 for a camera, 0 for radios."""
+    """The share of depth in all ranges: 0 for radios, which measure distances, 1 for a camera."""
     wheel_scale: dict[str, LearnedError]
     """The relative error of the distance of each robot: the part by which its odometry is too short."""
     turn_scale: dict[str, LearnedError]

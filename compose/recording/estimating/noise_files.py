@@ -29,16 +29,22 @@ It sets the bound below which a robot counts as standing, with which a gyro has 
 """
 
 CAMERA: Mapping[str, Any] = PROFILES["camera"]
-"""Priors for recordings that state the sigmas of ranges, which say nothing of other errors; and a delay.
+"""The priors for recordings that state the sigmas of ranges: these say nothing of other errors.
 
-Of ranges that are 0.3 s late at 1 m/s, 5 claims of 107 were wrong without that of the delay
-(by 5 of their sigmas along an axis), 2 of 113 with it, and the median error of a claim is 0.10 m, not 0.3 m.
-The ranges of MRCLAM 6 are depths: without that of the depth, 23 of 136 claims of three robots are wrong, now
-9 of 1 851. Ranges that are distances tell so: on TIERS, 798 poses are claimed instead of 1 002.
+With those of UNTOLD, without a depth, 23 of 136 claims of three robots of MRCLAM 6, whose ranges are depths,
+were wrong; with these, 9 of 1 851. Where ranges are distances, they cost claims: on TIERS, 798 poses are
+claimed instead of 1 002.
+"""
+
+STATED_DELAY_S: float = PROFILES["uwb"]["range_delay"]
+"""The prior in s of the delay of such ranges.
+
+Of ranges that are 0.3 s late at 1 m/s, 5 claims of 107 were wrong without it (by 5 of their sigmas along an
+axis), 2 of 113 with it, and the median error of a claim is 0.10 m, not 0.3 m.
 """
 
 ACCURATE = 0.002
-"""The sigma of ranges, as a fraction of their median, below which UNTOLD becomes narrower."""
+"""The sigma of ranges, as a fraction of their median, below which the priors become narrower."""
 
 FALLBACK: ProfileName = "uwb"
 """The profile for recordings that do not state the sigma of each range."""
@@ -111,17 +117,10 @@ def stated_noise(recording: RangeRecording) -> AssumedNoise:
     usual = float(np.median(sigmas))
     share = usual / max(ACCURATE * float(np.median(recording.ranges.range)), usual)
     size = share * usual / UNTOLD_SIGMA
-    noise = Noise(
-        anchor_sigma=usual,
-        mutual_sigma=usual,
-        range_bias=size * CAMERA["range_bias"],
-        pair_bias=size * UNTOLD.pair_bias,
-        range_scale=share**2 * CAMERA["range_scale"],
-        wheel_scale=share**2 * CAMERA["wheel_scale"],
-        gyro_bias=share**2 * CAMERA["gyro_bias"],
-        range_delay=PROFILES["uwb"]["range_delay"],
-        range_depth=CAMERA["range_depth"],
-    )
+    priors = {one: share**2 * CAMERA[one] for one in ("range_scale", "wheel_scale", "gyro_bias")}
+    priors |= {"range_bias": size * CAMERA["range_bias"], "pair_bias": size * UNTOLD.pair_bias}
+    priors |= {"range_delay": STATED_DELAY_S, "range_depth": CAMERA["range_depth"]}
+    noise = Noise(anchor_sigma=usual, mutual_sigma=usual, **priors)
     return AssumedNoise("stated in the recording", noise, stated=True)
 
 
