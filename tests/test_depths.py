@@ -32,7 +32,7 @@ LANDMARKS = tuple([
 
 
 def seen(seed: int, *, share: float) -> RangeRecording:
-    """Return a recording of one robot that measures the landmarks in its view; 1 as `share`: their depth."""
+    """Return a recording of one robot that measures the landmarks in its view, with this share of depth."""
     recording = driven(LANDMARKS, seed=seed)
     (robot,), ranges = recording.robots, recording.ranges
     assert robot.truth is not None
@@ -106,7 +106,7 @@ def test_the_share_of_depths_is_estimated_within_its_sigma_whichever_robot_has_m
 def test_a_mission_has_no_depths(tmp_path: Path, noise: str) -> None:
     path, noisy = tmp_path / "seen.toml", NOISY.read_text()
     path.write_text(noisy.replace("[mission.noise]", f"[mission.noise]\n{noise}"))
-    what = "mission.noise.range_depth: only in recordings may ranges be depths, as of a camera"
+    what = "mission.noise.range_depth: depths, and the profile 'camera', are for recordings only"
     refused(tandem("run", path), what)
 
 

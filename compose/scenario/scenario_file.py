@@ -373,7 +373,7 @@ def _check_noise(mission: Mission) -> None:
         )
     if mission.noise.range_depth:
         raise BadScenario(
-            "mission.noise.range_depth: only in recordings may ranges be depths, as of a camera"
+            "mission.noise.range_depth: depths, and the profile 'camera', are for recordings only"
         )
     why = too_small(mission.noise) or noise_infeasibility(mission) or safety_infeasibility(mission)
     if why is not None:
