@@ -114,7 +114,7 @@ class MovingGroup(NamedTuple):
     delay: float
     """The delay of all ranges in s."""
     share: float
-    """The share of all ranges that is a depth along the heading of the robot that has measured."""
+    """The share of depth in all ranges, along the heading of the robot that has measured."""
 
     @property
     def robots(self) -> list[str]:
@@ -190,7 +190,7 @@ def moving_group(
         return max(true * (1.0 + scale) + bias + own + noise.mutual_sigma * draw.normal() + more, 0.0)
 
     def seen(i: int, tick: int, away: Array) -> float:
-        """Return the distance of what is `away` from robot i, or the depth of it in part."""
+        """Return the distance (m) of what is `away` from robot i, with the share of its depth."""
         ahead = float(np.dot(away, (math.cos(headings[i, tick]), math.sin(headings[i, tick]))))
         return (1.0 - share) * float(np.hypot(*away)) + share * ahead
 

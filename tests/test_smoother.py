@@ -41,7 +41,7 @@ def problem_of(
 ) -> Problem:
     """Return the problem of a random group: with slow and surveying errors, a prior, a delay and strays.
 
-    `depth` is the prior of the share of ranges that is a depth.
+    `depth` is the prior of the share of depth in all ranges.
     """
     errors = {"slow_sigma": slow, "survey_error": survey, "range_delay": delay, "range_depth": depth}
     noise = replace(NOISE, odometry_strays=strays, **errors)
