@@ -47,6 +47,10 @@ class VelocityNoise(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
         return (self.v * v) ** 2 + self.v_floor**2, (self.omega * omega) ** 2 + self.omega_floor**2
 
 
+YAW = 0.3
+"""The prior (rad) of the angle between the axis of a camera and the heading of its robot."""
+
+
 class Priors(NamedTuple):
     """The standard deviations of the constant and slow errors that a robot estimates with its poses.
 
@@ -63,6 +67,11 @@ class Priors(NamedTuple):
     survey_error: float
     range_delay: float
     range_depth: float
+
+    @property
+    def range_aside(self) -> float:
+        """The prior of the share of ranges that is aside: a camera may look past the heading."""
+        return YAW * self.range_depth
 
     @property
     def of_odometry(self) -> bool:

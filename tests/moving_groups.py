@@ -148,7 +148,8 @@ def moving_group(
     centres = draw.uniform(0.0, side, (robots, 2))
     bias, scale = priors.range_bias * draw.normal(), priors.range_scale * draw.normal()
     delay = priors.range_delay * draw.normal() if priors.range_delay else 0.0
-    share = priors.range_depth * np.random.default_rng((robots, seed, robots)).normal()
+    shares = np.random.default_rng((robots, seed, robots)).normal(size=2)
+    share, side = priors.range_depth * shares[0], priors.range_aside * shares[1]
     headings = np.empty((robots, ticks + 1))
     late: list[Array] = []
     pair_bias: dict[frozenset[str], float] = {}
@@ -190,9 +191,10 @@ def moving_group(
         return max(true * (1.0 + scale) + bias + own + noise.mutual_sigma * draw.normal() + more, 0.0)
 
     def seen(i: int, tick: int, away: Array) -> float:
-        """Return the distance (m) of what is `away` from robot i, with the share of its depth."""
-        ahead = float(np.dot(away, (math.cos(headings[i, tick]), math.sin(headings[i, tick]))))
-        return (1.0 - share) * float(np.hypot(*away)) + share * ahead
+        """Return the distance of what is `away` from robot i, in part what its camera measures instead."""
+        c, s = math.cos(headings[i, tick]), math.sin(headings[i, tick])
+        ahead, left = c * away[0] + s * away[1], c * away[1] - s * away[0]
+        return float((1.0 - share) * np.hypot(*away) + share * ahead + side * left)
 
     for i, name in enumerate(names):
         if i in unanchored:

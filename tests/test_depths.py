@@ -31,15 +31,18 @@ LANDMARKS = tuple([
 ])  # fmt: skip
 
 
-def seen(seed: int, *, share: float) -> RangeRecording:
-    """Return a recording of one robot that measures the landmarks in its view, with this share of depth."""
+def seen(seed: int, *, share: float, yaw: float = 0.0) -> RangeRecording:
+    """Return a recording of one robot that measures the landmarks in its view, with this share of depth.
+
+    `yaw` (rad) is the angle of the axis of its camera to the heading.
+    """
     recording = driven(LANDMARKS, seed=seed)
     (robot,), ranges = recording.robots, recording.ranges
     assert robot.truth is not None
     x, y, heading = [np.interp(ranges.t, robot.truth.t, axis) for axis in robot.truth.poses.T]
     landmarks = np.array([(one.x, one.y) for one in LANDMARKS])
     away = landmarks[:, None] - np.stack((x, y), 1)  # of each landmark at each time
-    bearing = np.abs(np.angle(np.exp(1j * (np.arctan2(away[..., 1], away[..., 0]) - heading))))
+    bearing = np.abs(np.angle(np.exp(1j * (np.arctan2(away[..., 1], away[..., 0]) - heading - yaw))))
     far, at = np.hypot(away[..., 0], away[..., 1]), np.arange(len(x))
     nearest = np.where(bearing < HALF_VIEW, far, np.inf)
     which = np.argsort(nearest, 0)[at % 2, at]
@@ -74,6 +77,18 @@ def test_a_recording_tells_whether_its_ranges_are_depths_and_claims_are_right(
         assert not any(map(is_wrong, claims))
         learned = depth_of(found)
         assert abs(learned.value - share) < 4.0 * learned.sigma < 0.5
+
+
+@pytest.mark.parametrize("yaw", [0.1, -0.3])
+def test_a_camera_that_does_not_look_along_the_heading_leads_to_no_wrong_claim(yaw: float) -> None:
+    claims = [
+        row
+        for seed in range(4)
+        for row in estimate_of(seen(seed, share=1.0, yaw=yaw)).rows
+        if row.claim and row.nees is not None
+    ]
+    assert claims
+    assert not any(map(is_wrong, claims))
 
 
 @pytest.mark.parametrize("noise", ["wheels", "uwb-calibrated"])

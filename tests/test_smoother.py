@@ -94,7 +94,7 @@ def test_the_kernel_equals_its_text_to_the_bit(
     of.common[::4] = 0.0
     poses, constant, white = point_of(of, seed)
     kernel = Kernel(of, problem.weighing)
-    at = (poses, constant, white, 1.7)
+    at = (poses, constant, white, (1.7, -0.8))
     walk, text = kernel.walked(*at), smoother.walked(of, *at)
     for one, other in zip(walk, text, strict=True):
         assert one.tobytes() == other.tobytes()

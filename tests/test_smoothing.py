@@ -256,7 +256,7 @@ def test_a_range_changes_with_all_unknowns_as_the_linear_model_predicts(
         off = [dot([effect_of(of, walk, j, e) for e in range(len(common))], common.tolist()) for j in rows]
         return np.asarray(of.rho - walk.residual + off)
 
-    deep = float(at[6 + of.deep]) if of.deep >= 0 else 0.0
+    deep = at[6 + of.deep : 8 + of.deep].tolist() if of.deep >= 0 else (0.0, 0.0)
     walk = kernel.walked(poses, at[parts[1] :].reshape(2, -1), white, deep)
     assume(float(np.min(of.rho - walk.residual)) > 0.1)
     effects = smoother.forward(of, walk, poses, np.square(problem.weighing.sigma), update=False).effects

@@ -164,7 +164,7 @@ def point_at(
     of_slow: Array,
 ) -> Point:
     """Return the point with these start poses and errors."""
-    walk, cost = walked(of, poses, constant, white, common[of.deep] if of.deep >= 0 else 0.0), 0.0
+    walk, cost = walked(of, poses, constant, white, common[max(of.deep, 0) :]), 0.0
     for one in common.tolist():
         cost += one * one
     for one in constant.ravel().tolist():

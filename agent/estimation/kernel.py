@@ -12,7 +12,7 @@ import numpy as np
 from agent.estimation.compiled import Pointer, address, library
 from agent.estimation.gauss_newton import Convergence, Fitted, Point
 from agent.estimation.gaussian.range_weights import Weighing
-from agent.estimation.smoother import Array, FitStep, Measured, Singular, Walk
+from agent.estimation.smoother import NO_DEPTH, Array, Deep, FitStep, Measured, Singular, Walk
 
 
 class _Measured(ctypes.Structure):
@@ -83,10 +83,10 @@ class Kernel:
         """Return how to build the kernel again from a copy, which has memory of its own."""
         return Kernel, (self.of, self.by)
 
-    def walked(self, poses: Array, constants: Array, white: Array, depth: float = 0.0) -> Walk:
+    def walked(self, poses: Array, constants: Array, white: Array, deep: Deep = NO_DEPTH) -> Walk:
         """Return the paths; see `smoother.walked`."""
         arrays, memory = self._part(WALK, WALK + len(Walk._fields))
-        given = *map(address, (poses, constants, white)), ctypes.c_double(depth), address(memory)
+        given = map(address, (poses, constants, white, np.array(deep, np.float64), memory))
         library().paths(self._measured, *given)
         return Walk._make(arrays)
 

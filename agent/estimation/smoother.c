@@ -74,7 +74,7 @@ typedef struct {
 
 /* smoother.Walk */
 typedef struct {
-    double *place, *moves, *direction, *residual, *rate, *by_heading, *to_depth;
+    double *place, *moves, *direction, *residual, *rate, *by_heading, *to_depth, *aside;
 } Walk;
 
 /* smoother.Passed and smoother.Adjoint; `row_of` has the places and derivatives of a range. Those from
@@ -241,8 +241,8 @@ static void velocity_of(const Measured *of, const Walk *walk, Index i, Index k, 
     by[1] = v * sin(course);
 }
 
-/* Sets direction, residual, rate, by_heading and to_depth of range `j`, at tick `k`. */
-static void predict(const Measured *of, double depth, Index j, Index k, Walk *to)
+/* Sets all but the paths for range `j`, at tick `k`; `deep` has the errors that make it a depth. */
+static void predict(const Measured *of, const double *deep, Index j, Index k, Walk *to)
 {
     const Index ticks = of->ticks + 1, first = of->first[j], second = of->second[j];
     const Index observer = of->observer[j];
@@ -253,16 +253,19 @@ static void predict(const Measured *of, double depth, Index j, Index k, Walk *to
     if (distance < SMALLEST_DISTANCE) distance = SMALLEST_DISTANCE;
     double x = dx / distance, y = dy / distance;
     to->residual[j] = of->rho[j] - distance;
-    to->rate[j] = to->by_heading[j] = to->to_depth[j] = 0.0;
+    to->rate[j] = to->by_heading[j] = to->to_depth[j] = to->aside[j] = 0.0;
     if (of->deep >= 0) {
-        const double share = depth * of->effects[j * of->common + of->deep];
+        const double *effects = of->effects + j * of->common + of->deep;
+        const double share = deep[0] * effects[0], side = deep[1] * effects[1], rest = 1.0 - share;
         const double heading = to->place[3 * (observer * ticks + k) + 2];
-        const double sign = observer == second ? 1.0 : -1.0, rest = 1.0 - share;
+        const double sign = observer == second ? 1.0 : -1.0;
         const double c = sign * cos(heading), s = sign * sin(heading);
-        to->to_depth[j] = dx * c + dy * s - distance;
-        to->by_heading[j] = share * (dy * c - dx * s);
-        x = rest * x + share * c;
-        y = rest * y + share * s;
+        const double ahead = dx * c + dy * s, left = dy * c - dx * s;
+        to->to_depth[j] = ahead - distance;
+        to->aside[j] = left;
+        to->by_heading[j] = share * left - side * ahead;
+        x = rest * x + share * c - side * s;
+        y = rest * y + share * s + side * c;
     }
     to->direction[2 * j] = x;
     to->direction[2 * j + 1] = y;
@@ -281,8 +284,8 @@ static void predict(const Measured *of, double depth, Index j, Index k, Walk *to
 }
 
 static void walked(
-    const Measured *of, const double *poses, const double *constants, const double *white, double depth,
-    Walk *to)
+    const Measured *of, const double *poses, const double *constants, const double *white,
+    const double *deep, Walk *to)
 {
     const Index K = of->ticks, m = of->constant;
     for (Index i = 0; i < of->robots; i++) {
@@ -318,7 +321,7 @@ static void walked(
         }
     }
     for (Index k = 0; k <= K; k++)
-        for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) predict(of, depth, j, k, to);
+        for (Index j = of->begin[k]; j < of->begin[k + 1]; j++) predict(of, deep, j, k, to);
 }
 
 /* The derivatives of the start pose of robot `i` with respect to its unknowns. */
@@ -406,7 +409,7 @@ SIZED double effect_of(const Measured *of, const Walk *walk, Index j, Index e)
 {
     const double told = of->effects[j * of->common + e];
     if (e == of->delayed) return -told * walk->rate[j];
-    if (e == of->deep) return told * walk->to_depth[j];
+    if (of->deep >= 0 && e >= of->deep) return told * (e == of->deep ? walk->to_depth : walk->aside)[j];
     return e == of->scaled && told != 0.0 ? of->scale * (of->rho[j] - walk->residual[j]) : told;
 }
 
@@ -992,7 +995,7 @@ static void predicted(const Measured *of, Point *at)
 {
     const Index n3 = 3 * of->robots, c = of->common;
     double cost = 0.0;
-    walked(of, at->poses, at->constant, at->white, of->deep < 0 ? 0.0 : at->common[of->deep], &at->walk);
+    walked(of, at->poses, at->constant, at->white, at->common + (of->deep < 0 ? 0 : of->deep), &at->walk);
     for (Index e = 0; e < c; e++) cost += at->common[e] * at->common[e];
     for (Index e = 0; e < of->robots * of->constant; e++) cost += at->constant[e] * at->constant[e];
     for (Index e = 0; e < 2 * of->robots * of->ticks; e++)
@@ -1212,7 +1215,7 @@ static int holding(const Measured *told, const Weighing *by, Index steps, Work *
 
 /* --- the memory --------------------------------------------------------------------------------------- */
 
-#define POINT 15
+#define POINT 16
 #define STEP 12
 #define ARRAYS (2 * POINT + STEP + 4)
 
@@ -1229,7 +1232,7 @@ static Index sizes_of(const Measured *of, Index sizes[ARRAYS])
     const Index n = of->robots, n3 = 3 * n, K = of->ticks, N = of->ranges, c = of->common;
     const Index size = estimated(of), ticks = of->strays * n * K;
     const Index point[POINT] = {
-        n3, c, n * of->constant, 2 * n * K, N, N, n3 * (K + 1), 8 * n * K, 2 * N, N, N, N, N, N, 1};
+        n3, c, n * of->constant, 2 * n * K, N, N, n3 * (K + 1), 8 * n * K, 2 * N, N, N, N, N, N, N, 1};
     const Index rest[] = {
         size, size, size * size, 2 * n * K, N, N, N, N, N, n3 * n3, 5 * ticks, 4, N, N, ticks, 6};
     memcpy(sizes, point, sizeof point);
@@ -1279,14 +1282,14 @@ void prepared(Measured *of, Weighing *by, const double *floats, const Index *num
 
 /* The paths, in the order of Walk. */
 void paths(
-    const Measured *of, const double *poses, const double *constants, const double *white, double depth,
-    double *to)
+    const Measured *of, const double *poses, const double *constants, const double *white,
+    const double *deep, double *to)
 {
     Index sizes[ARRAYS];
     Walk walk;
     sizes_of(of, sizes);
-    placed((double **)&walk, to, sizes + 6, 7);
-    walked(of, poses, constants, white, depth, &walk);
+    placed((double **)&walk, to, sizes + 6, 8);
+    walked(of, poses, constants, white, deep, &walk);
 }
 
 /* A step; returns 0 if the information of the unknowns is not positive definite, and -2 without memory. */
@@ -1298,7 +1301,7 @@ int gauss_newton_step(const Measured *of, double *walk, const double *poses, con
     Step to;
     Work w;
     sizes_of(of, sizes);
-    placed((double **)&from, walk, sizes + 6, 7);
+    placed((double **)&from, walk, sizes + 6, 8);
     placed((double **)&to, memory, sizes + 2 * POINT, STEP);
     double *space = workspace(of, &w);
     if (!space) return NO_MEMORY;

@@ -19,6 +19,7 @@ same order, and their results are equal to the bit.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -28,6 +29,11 @@ Array = NDArray[np.float64]
 Places = NDArray[np.int64]
 Vector = list[float]
 Matrix = list[list[float]]
+Deep = Sequence[float] | Array
+"""The shares of depth and of what is aside, in sigmas."""
+
+NO_DEPTH: Deep = (0.0, 0.0)
+"""Those of ranges that are distances."""
 
 SLIGHT = 1e-4
 """The half turn in rad below which the series of a chord and of its derivative are used."""
@@ -77,7 +83,10 @@ class Measured(NamedTuple):
     delayed: int
     """the one of them that is a delay, whose `common` is its sigma in s, 0 where there is none; -1: none"""
     deep: int
-    """the one of them that is the share of depth, whose `common` is its sigma, 0 where none; -1: none"""
+    """the one before the last that is the share of depth, whose `common` is its sigma; -1: none
+
+    The last one is the share of what is aside: of a camera that does not look along the heading.
+    """
     observer: Places
     """the robot that has measured each range: a depth is along its heading; (N,)"""
     anchor: Places
@@ -140,6 +149,8 @@ class Walk(NamedTuple):
     """derivatives of the ranges by the heading of their observer in m; without depth 0; (N,)"""
     to_depth: Array
     """depths along that heading minus distances in m; 0 if no range may be a depth; (N,)"""
+    aside: Array
+    """distances to the left of it in m; 0 if no range may be a depth; (N,)"""
 
 
 class FitStep(NamedTuple):
@@ -183,14 +194,15 @@ class Singular(ArithmeticError):
     """The information of the unknowns is not positive definite."""
 
 
-def walked(of: Measured, poses: Array, constants: Array, white: Array, depth: float = 0.0) -> Walk:
+def walked(of: Measured, poses: Array, constants: Array, white: Array, deep: Deep = NO_DEPTH) -> Walk:
     """Return the paths from start `poses`, (3 n,), with constant and white errors, (n, m) and (n, 2, K).
 
-    `depth` is the share of depth in sigmas: it changes the derivatives of the ranges, not their residuals.
+    `deep` are the shares of depth and of what is aside in sigmas: they change the derivatives of the ranges,
+    not their residuals.
     """
     place, moves = _driven(of, poses, constants, white)
     ranges = [(j, k) for k in range(of.ticks + 1) for j in range(of.begin[k], of.begin[k + 1])]
-    rows = np.array([_predicted(of, place, moves, j, k, depth) for j, k in ranges]).reshape(-1, 6)
+    rows = np.array([_predicted(of, place, moves, j, k, deep) for j, k in ranges]).reshape(-1, 7)
     moved = np.array(moves).reshape(of.robots, of.ticks, 8)
     return Walk(np.array(place), moved, rows[:, :2], *np.ascontiguousarray(rows[:, 2:].T))
 
@@ -224,23 +236,22 @@ def _driven(of: Measured, poses: Array, constants: Array, white: Array) -> tuple
     return place, moves
 
 
-def _predicted(
-    of: Measured, place: list[Matrix], moves: list[Matrix], j: int, k: int, depth: float
-) -> Vector:
-    """Return direction, residual, rate, by_heading and to_depth of range `j`, at tick `k` (see Walk)."""
+def _predicted(of: Measured, place: list[Matrix], moves: list[Matrix], j: int, k: int, deep: Deep) -> Vector:
+    """Return what Walk has of range `j`, at tick `k`: from `direction` on."""
     at, other = place[of.first[j]][k], of.place[j]
     if of.second[j] >= 0:
         other = place[of.second[j]][k]
     dx, dy = at[0] - other[0], at[1] - other[1]
     distance = max(math.sqrt(dx * dx + dy * dy), SMALLEST_DISTANCE)
-    x, y, rate, by_heading, to_depth = dx / distance, dy / distance, 0.0, 0.0, 0.0
+    x, y, rate, by_heading, to_depth, left = dx / distance, dy / distance, 0.0, 0.0, 0.0, 0.0
     if of.deep >= 0:
-        share, heading = depth * of.common[j, of.deep], place[of.observer[j]][k][2]
-        sign, rest = 1.0 if of.observer[j] == of.second[j] else -1.0, 1.0 - share
+        share, side = deep[0] * of.common[j, of.deep], deep[1] * of.common[j, of.deep + 1]
+        heading, rest = place[of.observer[j]][k][2], 1.0 - share
+        sign = 1.0 if of.observer[j] == of.second[j] else -1.0
         c, s = sign * math.cos(heading), sign * math.sin(heading)
-        to_depth = dx * c + dy * s - distance
-        by_heading = share * (dy * c - dx * s)
-        x, y = rest * x + share * c, rest * y + share * s
+        ahead, left = dx * c + dy * s, dy * c - dx * s
+        to_depth, by_heading = ahead - distance, share * left - side * ahead
+        x, y = rest * x + share * c - side * s, rest * y + share * s + side * c
     if of.delayed >= 0 and k > 0:
         vx, vy = _velocity(of, place, moves, of.first[j], k)
         if of.second[j] >= 0:
@@ -248,7 +259,7 @@ def _predicted(
             vx, vy = vx - other_vx, vy - other_vy
         omega = of.omega[of.observer[j], k - 1] + moves[of.observer[j]][k - 1][7]
         rate = x * vx + y * vy + by_heading * omega
-    return [x, y, of.rho[j] - distance, rate, by_heading, to_depth]
+    return [x, y, of.rho[j] - distance, rate, by_heading, to_depth, left]
 
 
 def _velocity(of: Measured, place: list[Matrix], moves: list[Matrix], i: int, k: int) -> tuple[float, float]:
@@ -392,8 +403,8 @@ def effect_of(of: Measured, walk: Walk, j: int, e: int) -> float:
     told = float(of.common[j, e])
     if e == of.delayed:
         return -told * float(walk.rate[j])
-    if e == of.deep:
-        return told * float(walk.to_depth[j])
+    if 0 <= of.deep <= e:
+        return told * float((walk.to_depth if e == of.deep else walk.aside)[j])
     if e == of.scaled and told != 0.0:
         return of.scale * float(of.rho[j] - walk.residual[j])
     return told

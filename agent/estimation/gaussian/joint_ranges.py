@@ -53,7 +53,8 @@ less, 16 robots that all range each other would use fewer than 8 ranges of each 
 
 def range_errors(priors: Priors, pairs: int) -> list[str]:
     """Return the name in `priors` of each constant error of ranges, in the order of a fit of `pairs`."""
-    counts = {"range_bias": 1, "range_scale": 1, "pair_bias": pairs, "range_delay": 1, "range_depth": 1}
+    counts = {"range_bias": 1, "range_scale": 1, "pair_bias": pairs, "range_delay": 1}
+    counts |= {"range_depth": 1, "range_aside": 1}
     return [name for name, count in counts.items() if getattr(priors, name) for _ in range(count)]
 
 
@@ -115,7 +116,8 @@ class JointRanges(msgspec.Struct, frozen=True, dict=True, eq=False):
             begin = names.index("pair_bias")
             found[:, begin : begin + len(self.radios)] *= self.radio[:, None] == self.radios
         if priors.range_depth:
-            found[self.by_second & (self.second < 0), names.index("range_depth")] = 0.0  # the beacon measured
+            by_beacon = self.by_second & (self.second < 0)
+            found[by_beacon, names.index("range_depth") :] = 0.0
         return found
 
     def rows(self, some: NDArray[np.bool] | Places) -> JointRanges:

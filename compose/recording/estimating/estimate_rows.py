@@ -152,6 +152,8 @@ class LearnedErrors(msgspec.Struct, frozen=True):
     """The delay of all ranges in s: the time by which their stamps are late."""
     range_depth: LearnedError | None
     """The share of depth in all ranges: 0 for radios, which measure distances, 1 for a camera."""
+    range_aside: LearnedError | None
+    """The share of what is to the left: for a camera, the tangent of the angle of its axis to the heading."""
     wheel_scale: dict[str, LearnedError]
     """The relative error of the distance of each robot: the part by which its odometry is too short."""
     turn_scale: dict[str, LearnedError]

@@ -114,13 +114,13 @@ def learned_errors(fitted: EpochFit | None, pairs: Sequence[str]) -> LearnedErro
     learned: dict[str, list[LearnedError]] = {}
     for name in range_errors(priors, len(pairs)):
         learned.setdefault(name, []).append(next_of(getattr(priors, name)))
-    alike = ("range_bias", "range_scale", "range_delay", "range_depth")
-    bias, scale, delay, depth = [learned[name][0] if name in learned else None for name in alike]
+    alike = ("range_bias", "range_scale", "range_delay", "range_depth", "range_aside")
+    bias, scale, delay, depth, aside = [learned[name][0] if name in learned else None for name in alike]
     of_pairs = dict(zip(pairs, learned.get("pair_bias", ()), strict=False))
     odometry = (priors.wheel_scale, priors.wheel_scale, priors.gyro_bias)
     own = {name: [next_of(prior) for prior in odometry] for name in names if priors.of_odometry}
     wheels, turns, gyros = [{name: each[k] for name, each in own.items()} for k in range(3)]
-    return LearnedErrors(fit.level**0.5, bias, scale, of_pairs, delay, depth, wheels, turns, gyros)
+    return LearnedErrors(fit.level**0.5, bias, scale, of_pairs, delay, depth, aside, wheels, turns, gyros)
 
 
 def _anchors(
