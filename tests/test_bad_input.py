@@ -206,7 +206,8 @@ def test_noise_out_of_bounds_is_named(field: str, value: str) -> None:
 
 def test_a_profile_that_does_not_exist_is_named_with_those_that_do() -> None:
     refused_text(
-        with_noise("noise", '"little"'), "mission.noise.profile: there is no 'little'; there are uwb, "
+        with_noise("noise", '"little"'),
+        "mission.noise.profile: there is no 'little'; there are camera, uwb, ",
     )
 
 

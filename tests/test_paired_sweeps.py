@@ -51,6 +51,7 @@ OTHER: dict[str, Any] = {
     "mission.noise.sigma_degrees": 10.0,
     "mission.noise.survey_error": 0.01,
     "mission.noise.range_delay": 0.01,
+    "mission.noise.range_depth": 0.0,  # others are refused
     "mission.noise.strays": 0.01,
     "mission.noise.odometry_strays": 0.01,
     "mission.noise.anchor_sigma": 0.2,

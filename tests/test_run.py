@@ -109,6 +109,7 @@ def test_summary_has_every_documented_value_of_a_run(played: tuple[str, Path]) -
             "slow_sigma": 0.0,
             "survey_error": 0.0,
             "range_delay": 0.0,
+            "range_depth": 0.0,
             "slow_time": 2.0,
             "sigma_degrees": 4.0,
             "strays": 0.001,
