@@ -289,7 +289,7 @@ def test_a_pose_is_claimed_when_one_more_finder_than_may_lie_agrees_on_it() -> N
 def test_a_finder_that_has_heard_that_it_is_not_needed_sends_no_pose_and_does_not_stop_again() -> None:
     agent = of_frames(journals()).agents["u"]
     received = [framed.report for one in agent.steps for framed in one.received]
-    reports = [one for one in received if one.robot == "a"]
+    reports = [one for one in received if one.robot == "b"]
     assert {one.prior is None for one in reports} == {True, False}
     stops = [one.state == "looping" for one in reports]
     begins = [here and not before for before, here in zip([False, *stops], stops, strict=False)]

@@ -302,8 +302,8 @@ def test_lost_late_and_damaged_reports_are_shown(opened: Open, tmp_path: Path) -
         shot(page, "faults")
         page.locator("#radio").uncheck()
         expect(page.locator("#log")).not_to_contain_text("is lost")
-        page = opened(f"{where}#tick=15")
-        until_shown(page, 15)
+        page = opened(f"{where}#tick=55")
+        until_shown(page, 55)
         expect(page.locator(".probability li").first).to_contain_text("%")
 
 

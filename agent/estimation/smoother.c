@@ -37,6 +37,7 @@ const char *compiler(void)
 #define INLIER 0.5
 #define BY_CHANCE 2.0
 #define LEAST_LEVEL 0.25
+#define ROUNDED 1e-12
 #define MOST_CORRELATED 0.8
 #define LAST_STEP 3e-3
 #define LARGEST_STEP 0.3
@@ -983,7 +984,7 @@ static double residual_correlation(
         if (r > 0 && of->radio[j] == of->radio[by->by_radio[r - 1]]) neighbours += scaled * before;
         before = scaled;
     }
-    if (!(power > 0.0)) return 0.0;
+    if (!(power > ROUNDED * (double)of->ranges)) return 0.0;
     const double found = neighbours / power - BY_CHANCE * smaller(level, 1.0) / sqrt((double)of->ranges);
     return smaller(larger(found, 0.0), MOST_CORRELATED);
 }

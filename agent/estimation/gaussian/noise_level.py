@@ -23,6 +23,9 @@ leave small residuals, so these count as a sign of accurate ranges only as far a
 LEAST_LEVEL = 0.25
 """The least noise level, without correlation: sigmas of half the told ones."""
 
+ROUNDED = 1e-12
+"""The mean square of residuals, in their variances, up to which they are rounding, without correlation."""
+
 MOST_CORRELATED = 0.8
 """The largest correlation: the noise level grows by a factor of 9 at most."""
 
@@ -60,7 +63,7 @@ def residual_correlation(
         if j > 0 and radios[j] == radios[j - 1]:
             neighbours += scaled * before
         before = scaled
-    if not power > 0.0:
+    if not power > ROUNDED * len(residuals):
         return 0.0
     found = neighbours / power - BY_CHANCE * min(level, 1.0) / math.sqrt(len(residuals))
     return min(max(found, 0.0), MOST_CORRELATED)

@@ -119,6 +119,8 @@ def contradiction(fitted: Fit, measured: JointMeasurements, *, recorded: bool = 
     others, size = {}, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA
     for name in _others(noise) + ["camera"] * (recorded and not noise.range_depth):
         other = _profile(name, noise)
+        if recorded and all(one <= told for one, told in zip(other.priors, noise.priors, strict=True)):
+            continue  # wide priors explain less of what narrow ones explain, and contradict nothing
         biases = {one: size * getattr(other.priors, one) for one in ("range_bias", "pair_bias")}
         other = replace(other, slow_sigma=noise.slow_sigma, strays=noise.strays, **biases)
         errors = tuple([rescaled(one, noise, other) for one in fitted.start.errors])

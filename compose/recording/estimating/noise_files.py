@@ -31,6 +31,8 @@ It sets the bound below which a robot counts as standing, with which a gyro has 
 CAMERA: Mapping[str, Any] = PROFILES["camera"]
 """The priors for recordings that state the sigmas of ranges: these say nothing of other errors.
 
+In a recording of a mission, whose errors its robots know, the priors are those of UNTOLD.
+
 With those of UNTOLD, without a depth, 23 of 136 claims of three robots of MRCLAM 6, whose ranges are depths,
 were wrong; with these, 2 of 1 961. Where ranges are distances, they cost claims: on TIERS, 770 poses are
 claimed instead of 1 002.
@@ -117,9 +119,10 @@ def stated_noise(recording: RangeRecording) -> AssumedNoise:
     usual = float(np.median(sigmas))
     share = usual / max(ACCURATE * float(np.median(recording.ranges.range)), usual)
     size = share * usual / UNTOLD_SIGMA
-    priors = {one: share**2 * CAMERA[one] for one in ("range_scale", "wheel_scale", "gyro_bias")}
-    priors |= {"range_bias": size * CAMERA["range_bias"], "pair_bias": size * UNTOLD.pair_bias}
-    priors |= {"range_delay": STATED_DELAY_S, "range_depth": CAMERA["range_depth"]}
+    of: dict[str, Any] = {**UNTOLD._asdict(), **({} if recording.of_mission else CAMERA)}
+    priors = {one: share**2 * of[one] for one in ("range_scale", "wheel_scale", "gyro_bias")}
+    priors |= {one: size * of[one] for one in ("range_bias", "pair_bias")}
+    priors |= {"range_delay": STATED_DELAY_S, "range_depth": of["range_depth"]}
     noise = Noise(anchor_sigma=usual, mutual_sigma=usual, **priors)
     return AssumedNoise("stated in the recording", noise, stated=True)
 

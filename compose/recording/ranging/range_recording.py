@@ -119,6 +119,8 @@ class RangeRecording(NamedTuple):
     """The number of entries of the file that are no part of this model, by their kind."""
     origin: str | None = None
     """The robot whose first pose defined the frame of a run without anchors; None in that of anchors."""
+    of_mission: bool = False
+    """True if the ranges are those of a mission: distances, whose errors its robots know."""
 
     @property
     def radios(self) -> tuple[str, ...]:
@@ -187,7 +189,8 @@ class RangeRecording(NamedTuple):
         first, second = place[ranges.first], place[ranges.second]
         kept = (first >= 0) & (second >= 0) & (first_s <= ranges.t) & (ranges.t <= last_s)
         moved = ranges._replace(first=first, second=second)
-        return RangeRecording(self.source, robots, anchors, moved.rows(kept))
+        used = moved.rows(kept)
+        return RangeRecording(self.source, robots, anchors, used, of_mission=self.of_mission)
 
 
 LONG_GAP_S = 10.0

@@ -56,7 +56,7 @@ def ranges_of_run(run: Run, given: Sequence[AnchorRow] = ()) -> RangeRecording:
     for robot in setup.ids:
         for tick, pose in enumerate(run.truth(robot)):
             builder.add(TruePoseRow(robot, tick * period, pose.x, pose.y, pose.heading), run.source)
-    return builder.recording()._replace(origin=setup.origin)
+    return builder.recording()._replace(origin=setup.origin, of_mission=True)
 
 
 def _add_tick(
