@@ -23,9 +23,9 @@ class Numbers(msgspec.Struct, frozen=True):
     probability: float | UnsetType = UNSET
     """The probability of the first of them."""
     position_error_m: float | UnsetType = UNSET
-    """The distance of the first pose in the world frame from the true position.
+    """The distance of the leading pose in the world frame from the true position.
 
-    With exact sensors and several hypotheses, which are equally probable, it is that of the farthest one.
+    If no pose is more probable than all others together, it is that of the farthest hypothesis.
     """
     position_bound_m: float | UnsetType = UNSET
     """SIGMAS times the robot's standard deviation of the first pose's position."""
@@ -68,9 +68,7 @@ class Numbers(msgspec.Struct, frozen=True):
         return Numbers(
             hypotheses=len(hypotheses) if held is not None else UNSET,
             probability=held.shares[0] if held is not None and hypotheses else UNSET,
-            position_error_m=(distances[0] if covariance is not None else max(distances))
-            if distances
-            else UNSET,
+            position_error_m=(max(distances) if own is None else distances[0]) if distances else UNSET,
             position_bound_m=OUTLINE_SIGMAS * covariance.position_sigma if covariance is not None else UNSET,
             anchor_range_m=anchor_range if anchor_range is not None else UNSET,
             mutual_range_m=mutual if mutual is not None else UNSET,
