@@ -7,9 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
-from agent.estimation.fit import Start, fits
 from agent.estimation.following import ClaimRule
 from compose import scenario
 from compose.recording.estimating.estimate_rows import LearnedError
@@ -18,7 +16,6 @@ from compose.recording.estimating.recorded_measurements import measurements
 from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
 from docs.recorded_windows import is_wrong
 from tests.commands import refused, tandem
-from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
 from tests.range_tables import written_csv
 from tests.test_anchored import driven
 
@@ -99,22 +96,6 @@ def test_a_robot_with_a_camera_that_is_told_radios_claims_no_wrong_pose_and_hear
     assert not any(is_wrong(row) for one in found for row in one.rows if row.claim and row.nees is not None)
     reasons = [epoch.blocking_reason for one in found for epoch in one.epochs]
     assert any("the profile 'camera' explains them better" in reason for reason in reasons)
-
-
-def test_the_share_of_depths_is_estimated_within_its_sigma_whichever_robot_has_measured() -> None:
-    noise, off = replace(NOISE, range_depth=0.15), []
-    for seed in range(20):
-        group = moving_group(2, seed, ticks=60, noise=noise)
-        measured = joint_measurements(group.facts, noise, PERIOD_S)
-        assert 0 < np.count_nonzero(measured.ranges.by_second) < len(measured.ranges.rho)
-        starts = group.starts.copy()
-        starts[:, :2] -= measured.origin
-        (fit,) = fits(measured, [Start(starts)])
-        column = fit.problem.measured.deep
-        assert fit.constant_sigmas[column] < 0.1
-        off.append((group.share / 0.15 - fit.constants[column]) / fit.constant_sigmas[column])
-    assert max(map(abs, off)) < 4.0
-    assert 6.0 < np.sum(np.square(off)) < 42.0  # chi-square of 20 degrees of freedom: 0.2 and 99.7 %
 
 
 @pytest.mark.parametrize("noise", ['profile = "camera"', "range_depth = 0.5"])

@@ -224,17 +224,22 @@ def test_the_effect_of_a_delay_is_the_derivative_of_the_ranges_by_it() -> None:
     assert np.ptp(expected) > 0.05
 
 
-def test_a_delay_of_the_ranges_is_estimated_within_its_sigma() -> None:
-    noise, off = replace(NOISE, range_delay=0.3), []
+@pytest.mark.parametrize(("prior", "size", "most"), [("range_delay", 0.3, 0.3), ("range_depth", 0.15, 0.1)])
+def test_a_delay_and_the_share_of_depth_are_estimated_within_their_sigma_whoever_has_measured(
+    prior: str, size: float, most: float
+) -> None:
+    noise, off = replace(NOISE, **{prior: size}), []
     for seed in range(20):
         group = moving_group(2, seed, ticks=60, noise=noise)
         measured = joint_measurements(group.facts, noise, PERIOD_S)
+        assert 0 < np.count_nonzero(measured.ranges.by_second) < len(measured.ranges.rho)
         starts = group.starts.copy()
         starts[:, :2] -= measured.origin
         (fit,) = fits(measured, [Start(starts)])
-        column = fit.problem.measured.delayed
-        assert fit.constant_sigmas[column] < 0.3
-        off.append((group.delay / 0.3 - fit.constants[column]) / fit.constant_sigmas[column])
+        of, delays = fit.problem.measured, prior == "range_delay"
+        column, true = (of.delayed, group.delay) if delays else (of.deep, group.share)
+        assert fit.constant_sigmas[column] < most
+        off.append((true / size - fit.constants[column]) / fit.constant_sigmas[column])
     assert max(map(abs, off)) < 4.0
     assert 6.0 < np.sum(np.square(off)) < 42.0  # chi-square of 20 degrees of freedom: 0.2 and 99.7 %
 

@@ -33,7 +33,7 @@ Deep = Sequence[float] | Array
 """The shares of depth and of what is aside, in sigmas."""
 
 NO_DEPTH: Deep = (0.0, 0.0)
-"""Those of ranges that are distances."""
+"""The shares of ranges that are distances."""
 
 SLIGHT = 1e-4
 """The half turn in rad below which the series of a chord and of its derivative are used."""
