@@ -11,9 +11,11 @@ from __future__ import annotations
 
 import argparse
 import random
+import signal
 import sys
 import time
 from collections import Counter
+from threading import Event
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -202,14 +204,17 @@ def counted(run: Run, at_link: list[str], sigma: float) -> Counter[str]:
 
 
 def main(arguments: list[str]) -> int:
-    """Run missions of all attacks in turn until the time is used, and print the table."""
+    """Run missions of all attacks in turn until the time is used or a signal comes, and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
     parser.add_argument("--cpu", type=float, default=600.0, help="the processor time in s")
     parser.add_argument("--seed", type=int, default=1)
     options = parser.parse_args(arguments)
     draw = random.Random(f"{options.seed}/links")
     rows: dict[tuple[str, float], Counter[str]] = {}
-    while time.process_time() < options.cpu:
+    stopped = Event()
+    for signal_ in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(signal_, lambda *_: stopped.set())
+    while time.process_time() < options.cpu and not stopped.is_set():
         robots, sigma = draw.choice((4, 5)), draw.choice((0.001, 0.05))
         for attack in ATTACKS:
             table, at_link = table_of(attack, robots, sigma, draw)

@@ -13,6 +13,7 @@ from agent.estimation.claim import (
     BEFORE_SEARCH,
     CONDITIONS,
     Condition,
+    anchors,
     blocked,
     consistency,
     parts,
@@ -55,7 +56,8 @@ GIVEN_UP = (
 RETESTED = 1.1
 """The factor by which ranges must have grown before the places of the anchors are tested again.
 
-With less, claims of robots with many anchors take twice as long; with more, a false place is found later.
+They are tested before the first claim of a robot as well. With less, claims of robots with many anchors take
+twice as long; with more, a false place is found later.
 """
 
 CONFIRMED = 2.0
@@ -196,17 +198,15 @@ class Following(NamedTuple):
         }
         first = {name: blocked(one, BEFORE_SEARCH) for name, one in judged.items()}
         claiming = {name for name, one in first.items() if one is None or one.condition in DISPLACED}
-        shifts, tested, doubted = self.displacements, self.tested, self.doubted if claiming else 0
+        now = self._replace(part=part, judged=judged, doubted=self.doubted if claiming else 0)
+        count = len(part.ranges.rho)
         if claiming:
-            count = len(part.ranges.rho)
-            again = count >= RETESTED * tested or not claiming <= self.claimed
-            if again:
-                tested, shifts = count, tuple(displacements(found.hypotheses[0].fit, part))
-            displaced = displaced_anchor(shifts)
-            if again:
-                doubted = doubted or count if displaced is not None else 0
-            judged = {name: one._replace(displaced=displaced) for name, one in judged.items()}
-        reasons = {name: blocked(one, rule.conditions) for name, one in judged.items()}
+            now = now._displaced(retested=count >= RETESTED * self.tested)
+        reasons = {name: blocked(one, rule.conditions) for name, one in now.judged.items()}
+        by_anchors = [name for name, one in reasons.items() if one is None or one.condition is anchors]
+        if now.tested < count and claiming & {*by_anchors} - self.claimed:
+            now = now._displaced(retested=True)
+            reasons |= {name: blocked(now.judged[name], rule.conditions) for name in by_anchors}
         disagreed = {
             name: judged[name].ticks for name, one in reasons.items() if one and one.condition is parts
         }
@@ -215,13 +215,20 @@ class Following(NamedTuple):
             for name, one in reasons.items()
             if (one is None or one.condition in (parts, parts_before)) and judged[name].compares
         }
-        return self._replace(
-            part=part,
-            judged=judged,
+        return now._replace(
             reasons={name: one.reason if one is not None else "" for name, one in reasons.items()},
-            displacements=shifts,
-            tested=tested,
-            doubted=doubted,
             disagreed={**self.disagreed, **disagreed},
             compared={**self.compared, **compared},
         )
+
+    def _displaced(self, *, retested: bool) -> Following:
+        """Return this with what the latest test of the anchors says in `judged`, or a new one."""
+        now, part = self, self.part
+        assert part is not None
+        if retested:
+            found = tuple(displacements(self.known.hypotheses[0].fit, part))
+            now = now._replace(displacements=found, tested=len(part.ranges.rho))
+        displaced = displaced_anchor(now.displacements)
+        if retested:
+            now = now._replace(doubted=(now.doubted or now.tested) if displaced is not None else 0)
+        return now._replace(judged={n: one._replace(displaced=displaced) for n, one in now.judged.items()})
