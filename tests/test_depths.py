@@ -10,6 +10,7 @@ import pytest
 
 from agent.estimation.following import ClaimRule
 from compose import scenario
+from compose.errors import USER_ERROR
 from compose.recording.estimating.estimate_rows import LearnedError
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import measurements
@@ -107,9 +108,10 @@ def test_a_mission_has_no_depths(tmp_path: Path, noise: str) -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 1.0])
-def test_tandem_estimate_says_that_ranges_are_depths(tmp_path: Path, share: float) -> None:
+def test_estimate_and_calibrate_say_that_ranges_are_depths(tmp_path: Path, share: float) -> None:
     recording = seen(1, share=share)
     (robot,), ranges = recording.robots, recording.ranges
+    assert robot.truth is not None
     names = ("t0", "t1", "dx", "dy", "dheading")
     moves = np.column_stack((robot.odometry.t0, robot.odometry.t1, robot.odometry.increments)).tolist()
     lengths = zip(ranges.t.tolist(), (ranges.second - 1).tolist(), ranges.range.tolist(), strict=True)
@@ -120,9 +122,16 @@ def test_tandem_estimate_says_that_ranges_are_depths(tmp_path: Path, share: floa
             for t, k, rho in lengths
         ],
         "anchors": [{"anchor": one.id, "x": one.x, "y": one.y} for one in LANDMARKS],
+        "truth": [
+            {"robot": "A", "t": t, "x": x, "y": y, "heading": heading}
+            for t, (x, y, heading) in zip(robot.truth.t.tolist(), robot.truth.poses.tolist(), strict=True)
+        ],
     }
-    ended = tandem("estimate", written_csv(tmp_path / "seen", tables))
+    path = written_csv(tmp_path / "seen", tables)
+    ended, calibrated = tandem("estimate", path), tandem("calibrate", path)
     assert ended.status == 0
+    assert (calibrated.status == USER_ERROR) == (share > 0.0)
+    assert ("the ranges are depths along the headings, as of a camera" in calibrated.err) == (share > 0.0)
     assert ("the ranges are depths along the headings, as of a camera: a share of" in ended.out) == (
         share > 0.0
     )

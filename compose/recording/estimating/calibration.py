@@ -18,6 +18,7 @@ from compose.recording.estimating.radio_errors import (
     RadioErrors,
     RangeCalibration,
     absurd_error,
+    are_depths,
     range_calibration,
     true_errors,
 )
@@ -49,6 +50,9 @@ def calibrated(
         errors = true_errors(part)
         if not errors:
             raise NoTruth(f"no {FEWEST_ERRORS} ranges of a pair have true poses within {TRUTH_GAP_S:g} s")
+        if are_depths(part):
+            what = "the ranges are depths along the headings, as of a camera, and no distances of radios"
+            raise UserError(f"{recording.source}: {what}: estimate poses with --noise camera")
         found = range_calibration(errors, "the truth")
         for pair, one in found.pairs.items():
             if why := absurd_error(one.bias, one.sure_scale, float(np.max(errors[pair].measured))):

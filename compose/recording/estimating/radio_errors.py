@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.estimation.gaussian.range_weights import MEDIAN
-from compose.recording.estimating.true_poses import true_antenna, with_bridged_truth
+from compose.recording.estimating.true_poses import true_antenna, true_pose, with_bridged_truth
 from compose.recording.ranging.range_recording import Numbers, Places, RangeRecording
 
 OUTLIER_SIGMAS = 4.0
@@ -154,6 +154,42 @@ def true_errors(recording: RangeRecording) -> dict[tuple[str, str], PairErrors]:
         if np.count_nonzero(known) >= FEWEST_ERRORS:
             found[pair] = PairErrors(t[known], measured[known], (measured - distance)[known])
     return found
+
+
+DEPTH_RATIO = 0.5
+"""The ratio of the spread of ranges about depths to that about distances from which on they are depths.
+
+Those of MRCLAM, which are depths of cameras, have 0.39; radios have 20 and more. With more, radios of robots
+that only drive towards what they range would be taken for cameras.
+"""
+
+DEPTHS_OF_PAIR = 50
+"""The largest number of ranges of a pair of which depths are computed."""
+
+
+def are_depths(recording: RangeRecording) -> bool:
+    """Return whether ranges are rather depths, along the heading of the robot that measured, than distances.
+
+    The spreads about both are the medians of those of the pairs whose ends have true poses.
+    """
+    robots = {one.id: with_bridged_truth(one) for one in recording.robots}
+    fixed = {one.id: np.array((one.x, one.y)) for one in recording.anchors}
+    spreads = []
+    for rows in recording.pairs().values():
+        part = recording.ranges.rows(rows[:: -(-len(rows) // DEPTHS_OF_PAIR)])
+        off = []
+        for t, first, second, measured in zip(*[column.tolist() for column in part[:4]], strict=True):
+            names = recording.radios[first], recording.radios[second]
+            observer = true_pose(robots[names[0]], t)
+            seen = fixed[names[1]] if names[1] in fixed else true_pose(robots[names[1]], t)
+            if observer is not None and seen is not None:
+                x, y = (seen[:2] - observer[:2]).tolist()
+                depth = x * math.cos(observer[2]) + y * math.sin(observer[2])
+                off.append((measured - depth, measured - math.hypot(x, y)))
+        if len(off) >= FEWEST_ERRORS:
+            spreads.append([_robust_sigma(one) for one in np.array(off).T])
+    depth, distance = np.median(spreads, 0).tolist() if spreads else (math.inf, 0.0)
+    return bool(depth < DEPTH_RATIO * distance)
 
 
 def range_calibration(errors: Mapping[tuple[str, str], PairErrors], source: str) -> RangeCalibration:
