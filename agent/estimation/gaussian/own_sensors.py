@@ -117,7 +117,7 @@ def contradiction(fitted: Fit, measured: JointMeasurements, *, recorded: bool = 
     """
     noise = measured.noise
     others, size = {}, max(noise.anchor_sigma, noise.mutual_sigma) / UNTOLD_SIGMA
-    for name in _others(noise) + ["camera"] * (recorded and not noise.range_depth):
+    for name in _others(noise, CAMERAS if recorded and not noise.range_depth else ()):
         other = _profile(name, noise)
         if recorded and all(one <= told for one, told in zip(other.priors, noise.priors, strict=True)):
             continue  # wide priors explain less of what narrow ones explain, and contradict nothing
@@ -143,13 +143,16 @@ def _explains(name: ProfileName, pair: JointMeasurements, robot: int) -> bool:
     return bool(found) and consistency_test(found[0].fit, under, robot).p_value >= CLAIM_P_VALUE
 
 
-def _others(noise: Noise) -> list[ProfileName]:
-    """Return the profiles other than that of `noise`, the narrowest first."""
-    return [name for name in NARROWEST_FIRST if name != noise.profile]
+def _others(noise: Noise, further: tuple[ProfileName, ...] = ()) -> list[ProfileName]:
+    """Return the profiles other than that of `noise`, the narrowest first, then `further` ones."""
+    return [name for name in (*NARROWEST_FIRST, *further) if name != noise.profile]
 
 
 NARROWEST_FIRST: tuple[ProfileName, ...] = ("wheels", "uwb-calibrated", "uwb")
 """The profiles of missions, in the order of their priors."""
+
+CAMERAS: tuple[ProfileName, ...] = ("camera",)
+"""The profiles that are for recordings only."""
 
 
 def _best(what: str, log_evidence: dict[ProfileName, float], least: float) -> Doubt | None:
