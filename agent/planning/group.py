@@ -67,16 +67,16 @@ class GroupPlanner(Planner[RobotState, Report]):
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         before, state = state, self.pair_planner.observe(state, observation)
-        if state.in_contact and (before.agenda.alone or appointments.refused(before, state.config.peer)):
+        if state.in_contact and (before.alone or appointments.refused(before, state.config.peer)):
             state = replace(state, in_contact=False)
-        if state.agenda.visiting and _is_out_of_range_again(before, state):
+        if state.visiting and _is_out_of_range_again(before, state):
             state = state.doing(Travelling(visit.stop(state)))
         state = passing.onward(state, observation.contacts)
-        if isinstance(state.task, Travelling) and not state.in_contact and not state.agenda.passing.places:
+        if isinstance(state.task, Travelling) and not state.in_contact and not state.passing.places:
             state = visit.searching(state)
-        lasting = state.agenda.parting if state.in_contact == before.in_contact else 0
+        lasting = state.parting if state.in_contact == before.in_contact else 0
         parting = lasting + 1 if isinstance(state.task, Done) else 0
-        return state if parting == state.agenda.parting else state.with_agenda(parting=parting)
+        return state if parting == state.parting else replace(state, parting=parting)
 
     def report(self, state: RobotState) -> Report:
         """Return the report to the peer of the present meeting."""
@@ -87,22 +87,22 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        if (found := state.agenda.found) is not None and not searching.takes_part(state):
-            return found.answered(exchange.report_without_log(state, state.agenda.robot_verdict), peer)
+        if (found := state.found) is not None and not searching.takes_part(state):
+            return found.answered(exchange.report_without_log(state, state.robot_verdict), peer)
         if searching.is_helped(state, peer):
             return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):
-            report = exchange.report_without_log(state, state.agenda.failure)
+            report = exchange.report_without_log(state, state.failure)
         elif (state.meets and peer == state.config.peer) or peer == searching.beacon(state):
             return self.report(state)
         else:
             report = searching.outside_meeting(state, peer)
-        unconfirmed = state.config.confirms and state.agenda.fix is not None and report.verdict is None
+        unconfirmed = state.config.confirms and state.fix is not None and report.verdict is None
         return replace(report, state=UNCONFIRMED) if unconfirmed else report
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
-        if state.agenda.found is not None:
+        if state.found is not None:
             return self.pair_planner.decide(state, reports)
         if searching.is_apart(state):
             return self._apart(state, reports)
@@ -123,9 +123,9 @@ class GroupPlanner(Planner[RobotState, Report]):
         state = self.pair_planner.decide(before, of_peer)
         if before.verdict is None and state.verdict is not None and state.own_anchor.done_tick is None:
             return appointments.parted(before, state.verdict)  # it goes on with phase 1
-        silence = state.agenda.silence + 1 if state.in_contact and not of_peer else 0
-        if silence != state.agenda.silence:
-            state = state.with_agenda(silence=silence)
+        silence = state.silence + 1 if state.in_contact and not of_peer else 0
+        if silence != state.silence:
+            state = replace(state, silence=silence)
         if isinstance(state.verdict, Localised) and before.verdict is None:
             state = meetings.with_pose(state, state.verdict)
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
@@ -155,9 +155,9 @@ class GroupPlanner(Planner[RobotState, Report]):
         rests, config = meetings.rests(state), state.config
         meets = state.meets and not rests
         command = self.pair_planner.command(state)
-        verdict = state.agenda.robot_verdict
+        verdict = state.robot_verdict
         unconfirmed = config.confirms and verdict is None and isinstance(state.verdict, Localised)
-        controls = passing.limited(Controls(command.v, command.omega), state.agenda.passing, config.mission)
+        controls = passing.limited(Controls(command.v, command.omega), state.passing, config.mission)
         return replace(
             command,
             v=controls.v,
@@ -176,12 +176,12 @@ class GroupPlanner(Planner[RobotState, Report]):
         planner does not compute how the noise of the odometry adds up.
         """
         estimate, latest = self.pair_planner.estimate(state), state.verdict
-        if state.agenda.fix is None:
+        if state.fix is None:
             return estimate
         return replace(
             estimate,
-            world=(compose(state.agenda.frame, state.odometry),),
-            localised=isinstance(state.agenda.robot_verdict, Localised),
+            world=(compose(state.frame, state.odometry),),
+            localised=isinstance(state.robot_verdict, Localised),
             probabilities=(),
             covariance=latest.covariance if isinstance(latest, Localised) else None,
         )

@@ -14,7 +14,6 @@ from msgspec.structs import replace
 
 from agent.peer import peer_state
 from agent.planning import drive, exchange
-from agent.planning.agenda import Agenda
 from agent.planning.planner import Planner, Summary
 from agent.planning.state import RobotState
 from agent.planning.tasks import Asleep, Deciding, Done, Travelling
@@ -40,14 +39,14 @@ class MeetingPlanner(Planner[RobotState, Report]):
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet."""
-        return RobotState(config, agenda=Agenda(own=(0, self._planner.start(config))))
+        return RobotState(config, own_state=(0, self._planner.start(config)))
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick; the planner of the user gets those of its peer."""
         state = exchange.observed(state, observation)
         contacts = tuple([one for one in observation.contacts if one.peer == state.config.peer])
         own = self._planner.observe(self._own(state), replace(observation, contacts=contacts))
-        return state.with_agenda(own=(state.agenda.meeting, own))
+        return replace(state, own_state=(state.meeting, own))
 
     def report(self, state: RobotState) -> Report:
         """Return the report to the peer: that of the user's planner, and what the group has to know."""
@@ -69,7 +68,7 @@ class MeetingPlanner(Planner[RobotState, Report]):
             peer = peer_state.with_report(peer, one)
         bodies = [self._decoder.decode(one.body) for one in reports if one.body is not None]
         own = self._planner.decide(self._own(state), bodies)
-        state = replace(state, peer_state=peer).with_agenda(own=(state.agenda.meeting, own))
+        state = replace(state, peer_state=peer, own_state=(state.meeting, own))
         if isinstance(state.task, Done) or (isinstance(state.task, Travelling) and not state.in_contact):
             return state
         command, known = self._planner.command(own), state.own_anchor
@@ -95,8 +94,8 @@ class MeetingPlanner(Planner[RobotState, Report]):
 
     def _own(self, state: RobotState) -> Any:
         """Return the state of the user's planner in the present meeting."""
-        number, own = state.agenda.own
-        return own if number == state.agenda.meeting else self._planner.meet(own, state.config)
+        number, own = state.own_state
+        return own if number == state.meeting else self._planner.meet(own, state.config)
 
     # --- optional ---
 

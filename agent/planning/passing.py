@@ -16,8 +16,7 @@ from collections.abc import Collection, Mapping, Sequence
 from msgspec.structs import replace
 
 from agent.planning import drive, phase2_orbit, separation, visit
-from agent.planning.agenda import Bypass
-from agent.planning.state import RobotState
+from agent.planning.state import Bypass, RobotState
 from agent.planning.tasks import Orbital, Orbiting, Travelling, transformed
 from protocol.coverage_strips import Place
 from protocol.messages import Contact
@@ -55,25 +54,25 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
 
     A peer that does not go on with the meeting is passed like any other robot.
     """
-    mission, passing, task = state.config.mission, state.agenda.passing, state.task
+    mission, passing, task = state.config.mission, state.passing, state.task
     if not mission.safety_distance:
         return state
     met = state.config.peer if state.in_contact else None
     ranges = {one.peer: one.range for one in contacts if one.peer != met}
     stays = isinstance(task, Orbiting) and state.config.orbit.v == 0.0
     if stays or not isinstance(task, Travelling | Orbital):
-        return state.with_agenda(passing=Bypass(leeway(ranges, mission), detours=passing.detours))
+        return replace(state, passing=Bypass(leeway(ranges, mission), detours=passing.detours))
     if passing.places:  # what it does after the way aside begins where that ends
         on_visit = isinstance(task, Travelling)
         state = state.doing(Travelling(visit.stop(state)) if on_visit else phase2_orbit.aligning(state))
         if drive.way_to(state, passing.places[0], backward=True) is None:
             passing = replace(passing, places=passing.places[1:])
-            state = state.with_agenda(passing=passing)
+            state = replace(state, passing=passing)
     before = [one for one in ranges if one < state.config.robot]
     after = passed(passing, ranges, before, state.odometry, drive.controls(state), mission)
     if after.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
         after = replace(after, places=after.places[:2])  # its next task leads past the other robot
-    return state.with_agenda(passing=after)
+    return replace(state, passing=after)
 
 
 def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:

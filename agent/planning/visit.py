@@ -23,7 +23,7 @@ def searching(state: RobotState) -> RobotState:
     assert isinstance(state.task, Travelling)
     if way_to(state, state.task.place) is not None:
         return state
-    begin, anchor = state.agenda.framed_at, _peer_anchor(state)
+    begin, anchor = state.framed_at, _peer_anchor(state)
     leg = next_leg(state.task, (begin.x, begin.y), (anchor.x, anchor.y), state.config.mission)
     return state.doing(leg)
 
@@ -55,11 +55,11 @@ def _search_sides(state: RobotState) -> int:
 
     They reach SEARCHED_SIGMAS of the error that the heading at the claim has led to, to either side.
     """
-    assert state.agenda.fix is not None
-    if state.agenda.fix.claim.covariance is None:
+    assert state.fix is not None
+    if state.fix.claim.covariance is None:
         return 0
-    begin, anchor = state.agenda.framed_at, _peer_anchor(state)
-    sigma = state.agenda.fix.claim.covariance.heading_sigma
+    begin, anchor = state.framed_at, _peer_anchor(state)
+    sigma = state.fix.claim.covariance.heading_sigma
     aside = SEARCHED_SIGMAS * sigma * math.hypot(anchor.x - begin.x, anchor.y - begin.y)
     needed = 1 + math.ceil(0.5 * aside / state.config.mission.sensing_range)
     return min(max(SEARCH_SIDES, needed), MOST_SIDES)
@@ -68,7 +68,7 @@ def _search_sides(state: RobotState) -> int:
 def _peer_anchor(state: RobotState) -> Pose:
     """Return the place of the peer's anchor, in m in the odometry's frame."""
     peer_anchor = state.config.peer_anchor
-    return compose(inverse(state.agenda.frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
+    return compose(inverse(state.frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
 
 
 def stop(state: RobotState) -> tuple[float, float]:
