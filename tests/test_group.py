@@ -20,7 +20,7 @@ from agent.planning.appointments import PEER_LOST_AFTER
 from agent.planning.drive import towards
 from agent.planning.state import Fix
 from agent.planning.tasks import Done, Travelling
-from agent.planning.visit import MOST_SIDES, next_leg
+from agent.planning.travelling import MOST_SIDES, next_leg
 from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of

@@ -8,7 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.planning.passing import (
+from agent.planning.state import Bypass
+from agent.planning.travelling import (
     BLOCKED_AFTER,
     MOST_YIELDED,
     RESERVE,
@@ -17,7 +18,6 @@ from agent.planning.passing import (
     limited,
     passed,
 )
-from agent.planning.state import Bypass
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest

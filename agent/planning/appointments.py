@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from agent.estimation.knowledge import MeetingPosterior
 from agent.peer.peer_state import PeerState
-from agent.planning import phase2_orbit, searching, visit
+from agent.planning import phase2_orbit, searching, travelling
 from agent.planning.state import RobotState
 from agent.planning.tasks import Asleep, Orbital, Travelling
 from protocol.messages import Appointment, Member, Undecided, Verdict
@@ -70,7 +70,7 @@ def _is_late(state: RobotState, member: Member) -> bool:
 def on_visit(state: RobotState, peer: str) -> RobotState:
     """Return `state` of a localised robot that drives to `peer`."""
     state = _in_meeting(state, peer, "a")
-    return replace(state, task=Travelling(visit.stop(state)), visiting=True)
+    return replace(state, task=Travelling(travelling.stop(state)), visiting=True)
 
 
 def at_anchor(state: RobotState) -> RobotState:

@@ -21,10 +21,9 @@ from agent.planning import (
     confirmation,
     exchange,
     meetings,
-    passing,
     plausibility,
     searching,
-    visit,
+    travelling,
 )
 from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
@@ -70,10 +69,10 @@ class GroupPlanner(Planner[RobotState, Report]):
         if state.in_contact and (before.alone or appointments.refused(before, state.config.peer)):
             state = replace(state, in_contact=False)
         if state.visiting and _is_out_of_range_again(before, state):
-            state = state.doing(Travelling(visit.stop(state)))
-        state = passing.onward(state, observation.contacts)
+            state = state.doing(Travelling(travelling.stop(state)))
+        state = travelling.onward(state, observation.contacts)
         if isinstance(state.task, Travelling) and not state.in_contact and not state.passing.places:
-            state = visit.searching(state)
+            state = travelling.searching(state)
         lasting = state.parting if state.in_contact == before.in_contact else 0
         parting = lasting + 1 if isinstance(state.task, Done) else 0
         return state if parting == state.parting else replace(state, parting=parting)
@@ -104,6 +103,8 @@ class GroupPlanner(Planner[RobotState, Report]):
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
         if state.found is not None:
             return self.pair_planner.decide(state, reports)
+        for one in reports:
+            state = meetings.with_sender(state, one)
         if searching.is_apart(state):
             return self._apart(state, reports)
         state = self._met(state, reports)
@@ -111,8 +112,6 @@ class GroupPlanner(Planner[RobotState, Report]):
 
     def _met(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the decisions of the present meeting, or in the next one if it has ended."""
-        for one in reports:
-            state = meetings.with_sender(state, one)
         anchored = [one.robot for one in state.config.members]
         logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
         visitors = [one.robot for one in logs if one.state == Travelling.name]
@@ -142,7 +141,6 @@ class GroupPlanner(Planner[RobotState, Report]):
     def _apart(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
         for one in reports:
-            state = meetings.with_sender(state, one)
             state = state.with_other(one.robot, acknowledged=one.heard)  # if overtaken, more is sent again
         of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
         heard = plausibility.with_reports(state, of_peer, self.pair_planner.rendezvous)
@@ -157,7 +155,7 @@ class GroupPlanner(Planner[RobotState, Report]):
         command = self.pair_planner.command(state)
         verdict = state.robot_verdict
         unconfirmed = config.confirms and verdict is None and isinstance(state.verdict, Localised)
-        controls = passing.limited(Controls(command.v, command.omega), state.passing, config.mission)
+        controls = travelling.limited(Controls(command.v, command.omega), state.passing, config.mission)
         return replace(
             command,
             v=controls.v,

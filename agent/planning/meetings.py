@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import appointments, coverage, searching, visit
+from agent.planning import appointments, coverage, searching, travelling
 from agent.planning.state import Fix, RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
 from protocol.messages import Localised, Report, Undecided
@@ -124,7 +124,7 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
     if state.visiting and state.verdict is None:
         if state.other(peer).localised and state.robot_verdict is not None:  # by another robot
             return appointments.next_visit(state)
-        if visit.has_searched(state):
+        if travelling.has_searched(state):
             return appointments.next_visit(state.with_other(peer, missed=state.tick))
         if appointments.is_silent(state):
             return appointments.next_visit(appointments.parted(state))
