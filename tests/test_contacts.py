@@ -186,6 +186,6 @@ def test_a_robot_that_reports_another_reference_in_each_tick_costs_an_estimate_i
         report = Report(tick, "b", 2, "looping", since=here, through=tick, runs=runs, prior=prior)
         assert planner.malformed(report) is None
         state = planner.decide(state, [report])
-        assert isinstance(state.agenda.found, Contacted)
-        estimates.add(state.agenda.found.estimated_tick)
+        assert isinstance(state.found, Contacted)
+        estimates.add(state.found.estimated_tick)
     assert 5 <= len(estimates) <= 20

@@ -16,11 +16,11 @@ from msgspec.structs import replace
 
 from agent.estimation.knowledge import Knowledge
 from agent.planning import meetings
-from agent.planning.agenda import Fix
 from agent.planning.appointments import PEER_LOST_AFTER
 from agent.planning.drive import towards
+from agent.planning.state import Fix
 from agent.planning.tasks import Done, Travelling
-from agent.planning.visit import MOST_SIDES, next_leg
+from agent.planning.travelling import MOST_SIDES, next_leg
 from compose.errors import BadScenario, Unworkable, UserError
 from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
@@ -157,7 +157,7 @@ def test_a_robot_in_phase_1_goes_on_with_it_when_its_peer_ends_their_meeting(sig
     state = planner.observe(planner.start(config), Observation(0, "r0", None, 1.0, near))
     refusal = Report(0, config.peer, 1, "straight", None, 0, 0, (), 0, (), 0, 0, Undecided("a false log"))
     after = planner.decide(state, [refusal])
-    assert after.agenda.robot_verdict is None
+    assert after.robot_verdict is None
     assert after.other(config.peer).failed
     command = planner.command(after)
     assert (command.phase, command.task) == (1, "straight")
@@ -176,11 +176,10 @@ def test_a_localised_robot_waits_for_its_peer_beside_it_for_a_bounded_time(
     config = scenario.config(scenario.meetings[-1].visitor)
     planner = planner_of(config)
     state, claim = planner.start(config), Localised(Pose(0.0, 0.0, 0.0))
-    state = replace(state, task=Done(3, claim), in_contact=True).with_agenda(
-        fix=Fix(Knowledge(config, 0), claim, (config.peer,))
-    )
-    state = state.with_agenda(robot_verdict=claim, silence=silence)
-    assert meetings.onward(state, peer_has_left=refused).agenda.visiting == leaves
+    fix = Fix(Knowledge(config, 0), claim, (config.peer,))
+    state = replace(state, task=Done(3, claim), in_contact=True, fix=fix)
+    state = replace(state, robot_verdict=claim, silence=silence)
+    assert meetings.onward(state, peer_has_left=refused).visiting == leaves
 
 
 def test_a_robot_sends_its_log_only_to_the_robot_that_it_meets(tmp_path: Path) -> None:

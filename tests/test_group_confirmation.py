@@ -107,15 +107,13 @@ def test_a_robot_claims_a_pose_later_than_it_knows_one_and_by_two_peers_that_agr
     run = of_frames(without_attacker())
     for robot in run.robots:
         before, after = next(
-            (one, other)
-            for one, other in pairwise(states(run, robot))
-            if other.agenda.robot_verdict is not None
+            (one, other) for one, other in pairwise(states(run, robot)) if other.robot_verdict is not None
         )
-        assert before.agenda.robot_verdict is None
-        assert before.agenda.fix is not None
-        assert isinstance(after.agenda.robot_verdict, Localised)
-        peers = {one.config.peer for one in after.agenda.confirming.meetings}
-        assert len(peers) == len(after.agenda.confirming.meetings) >= 2
+        assert before.robot_verdict is None
+        assert before.fix is not None
+        assert isinstance(after.robot_verdict, Localised)
+        peers = {one.config.peer for one in after.confirming.meetings}
+        assert len(peers) == len(after.confirming.meetings) >= 2
 
 
 def test_a_robot_that_knows_a_pose_says_that_it_is_unconfirmed_and_makes_no_claim() -> None:
@@ -186,7 +184,7 @@ def test_a_robot_leaves_for_its_anchor_though_the_one_that_it_has_met_is_in_rang
         steps = run.agents[robot].steps[1:]
         for (before, state), step in zip(pairwise(states(run, robot)), steps, strict=True):
             in_range = [one.peer for one in step.observation.contacts]
-            if before.agenda.alone and state.agenda.alone and state.config.peer in in_range:
+            if before.alone and state.alone and state.config.peer in in_range:
                 left += 1
                 assert not state.in_contact
     assert left > 4
@@ -199,7 +197,7 @@ def test_the_pose_after_a_long_way_does_not_depend_on_the_hypotheses_of_its_meet
     found = 0
     for robot in run.robots:
         state = states(run, robot)[-1]
-        for met in state.agenda.confirming.meetings:
+        for met in state.confirming.meetings:
             expected = later_pose(met, state)
             again = later_pose(replace(met, posterior=replace(met.posterior, pair=())), state)
             if expected is None:
@@ -214,23 +212,23 @@ def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
     """Without it, the agreement of a late meeting was not found."""
     run = of_frames(without_attacker())
     found = states(run, "r1")
-    tick = next(tick for tick, one in enumerate(found) if one.agenda.robot_verdict is not None)
+    tick = next(tick for tick, one in enumerate(found) if one.robot_verdict is not None)
     before, after, step = found[tick - 1], found[tick], run.agents["r1"].steps[tick]
     config = before.config
     assert config.confirms
-    assert isinstance(after.agenda.robot_verdict, Localised)
-    assert after.agenda.fix is not None
-    assert after.agenda.fix.known.tick < after.tick  # no meeting has just ended
+    assert isinstance(after.robot_verdict, Localised)
+    assert after.fix is not None
+    assert after.fix.known.tick < after.tick  # no meeting has just ended
     planner = planner_of(config)
 
     def decided(gives_up: float) -> RobotState:
-        confirming = replace(before.agenda.confirming, ranges=10**6)
-        state = replace(before, config=replace(config, gives_up=gives_up)).with_agenda(confirming=confirming)
+        confirming = replace(before.confirming, ranges=10**6)
+        state = replace(before, config=replace(config, gives_up=gives_up), confirming=confirming)
         state = planner.observe(state, step.observation)
         return planner.decide(state, [framed.report for framed in step.received])  # type: ignore[no-any-return]
 
-    assert decided(math.inf).agenda.robot_verdict is None
-    assert decided(0.0).agenda.robot_verdict == after.agenda.robot_verdict
+    assert decided(math.inf).robot_verdict is None
+    assert decided(0.0).robot_verdict == after.robot_verdict
 
 
 @pytest.mark.long

@@ -13,9 +13,8 @@ from agent.estimation.gaussian.claim_agreement import difference
 from agent.estimation.knowledge import Knowledge
 from agent.peer.motion_log import MotionLog
 from agent.planning import meetings
-from agent.planning.agenda import Fix, Other
 from agent.planning.group import GroupPlanner
-from agent.planning.state import RobotState
+from agent.planning.state import Fix, Other, RobotState
 from compose.audit.rules import audit_run
 from compose.errors import Unworkable
 from compose.launch.in_process import run_mission
@@ -109,32 +108,32 @@ def after_meetings(agreeing: tuple[str, ...]) -> RobotState:
     assert isinstance(planner, GroupPlanner)
     state = planner.start(config.in_meeting("r1", "a"))
     claim = Localised(ORIGIN, SMALL)
-    return state.with_agenda(robot_verdict=claim, fix=Fix(Knowledge(state.config, 0), claim, agreeing))
+    return replace(state, robot_verdict=claim, fix=Fix(Knowledge(state.config, 0), claim, agreeing))
 
 
 def test_a_pose_on_which_two_meetings_agree_stays_and_the_third_peer_is_not_met_again() -> None:
     state = after_meetings(("r2", "r3"))
     after = meetings.with_pose(state, Localised(Pose(0.0, 0.0, 2.0), SMALL))
-    assert (after.agenda.robot_verdict, after.agenda.fix) == (state.agenda.robot_verdict, state.agenda.fix)
-    assert after.agenda.frame == state.agenda.frame
+    assert (after.robot_verdict, after.fix) == (state.robot_verdict, state.fix)
+    assert after.frame == state.frame
     assert after.other("r1").failed
 
 
 def test_a_pose_from_one_meeting_is_withdrawn_with_both_peers_if_the_next_contradicts_it() -> None:
     state = after_meetings(("r2",))
     after = meetings.with_pose(state, Localised(Pose(0.0, 0.0, 2.0), SMALL))
-    assert (after.agenda.robot_verdict, after.agenda.fix) == (None, None)
-    assert isinstance(after.agenda.failure, Undecided)
-    assert after.agenda.failure.reason.startswith("r2 and r1 contradict each other")
+    assert (after.robot_verdict, after.fix) == (None, None)
+    assert isinstance(after.failure, Undecided)
+    assert after.failure.reason.startswith("r2 and r1 contradict each other")
     assert after.other("r2") == Other(failed=True)
 
 
 def test_a_meeting_that_agrees_changes_no_claim() -> None:
     state = after_meetings(("r2",))
     after = meetings.with_pose(state, Localised(Pose(0.1, -0.1, 0.1), SMALL))
-    assert after.agenda.robot_verdict == state.agenda.robot_verdict
-    assert after.agenda.fix is not None
-    assert after.agenda.fix.peers == ("r2", "r1")
+    assert after.robot_verdict == state.robot_verdict
+    assert after.fix is not None
+    assert after.fix.peers == ("r2", "r1")
 
 
 def test_the_p_values_of_right_claims_are_uniform_or_larger() -> None:

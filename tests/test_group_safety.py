@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.planning.agenda import Bypass
-from agent.planning.passing import (
+from agent.planning.state import Bypass
+from agent.planning.travelling import (
     BLOCKED_AFTER,
     MOST_YIELDED,
     RESERVE,

@@ -246,11 +246,11 @@ def in_search(run: Run, peers: tuple[str, ...], shift: float) -> RobotState | No
     state, changed = planner.start(agent.config), False
     for one in agent.steps:
         state = planner.observe(state, one.observation)
-        fix = state.agenda.fix
+        fix = state.fix
         if not changed and fix is not None and state.config.peer == "c" and state.in_contact:
             pose = replace(fix.claim.pose, x=fix.claim.pose.x + shift)
             fix = replace(fix, peers=peers, claim=replace(fix.claim, pose=pose))
-            state, changed = state.with_agenda(fix=fix), True
+            state, changed = replace(state, fix=fix), True
         state = planner.decide(state, of_robots(one))
         if state.covers:
             return state
@@ -280,13 +280,13 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     state = planner.start(agent.config)
     for one in agent.steps[: first + 1]:
         if one.observation.tick == first:
-            assert state.agenda.fix is not None
-            claim = state.agenda.fix.claim
+            assert state.fix is not None
+            claim = state.fix.claim
             claim = replace(claim, pose=replace(claim.pose, x=claim.pose.x + shift))
-            state = state.with_agenda(fix=replace(state.agenda.fix, claim=claim, peers=peers))
+            state = replace(state, fix=replace(state.fix, claim=claim, peers=peers))
         state = planner.observe(state, one.observation)
         state = planner.decide(state, of_robots(one))
-    assert (state.agenda.own_pose.reference is not None) == (shift == 0.0)
+    assert (state.own_pose.reference is not None) == (shift == 0.0)
     if shift == 0.0 or len(peers) > 1:
         assert isinstance(planner.command(state).verdict, Localised)
         assert state.covers
@@ -294,9 +294,9 @@ def test_a_claim_that_later_ranges_contradict_is_withdrawn_in_the_search_and_no_
     command = planner.command(state)
     assert command.verdict is None
     assert command.task in ("aligning", "radial", "orbiting")
-    assert isinstance(state.agenda.failure, Undecided)
-    assert state.agenda.failure.reason.startswith("its ranges since its claim contradict it by ")
-    assert planner.report_to(state, state.config.peer).verdict == state.agenda.failure
+    assert isinstance(state.failure, Undecided)
+    assert state.failure.reason.startswith("its ranges since its claim contradict it by ")
+    assert planner.report_to(state, state.config.peer).verdict == state.failure
 
 
 def test_a_robot_that_takes_a_finder_anew_receives_the_manoeuvres_since_the_reference_again() -> None:

@@ -16,7 +16,6 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 from playwright.sync_api import expect
 
-from agent.planning.agenda import Agenda
 from agent.planning.coverage import second_half, strips, without_strips
 from agent.planning.group import GroupPlanner
 from agent.planning.state import RobotState
@@ -169,7 +168,7 @@ def test_a_finder_and_the_robot_that_it_has_found_sweep_each_strip_once(
     area, ends = SweptArea(0.0, 0.0, 300.0, 300.0, parts), (first, first + more)
     config = replace(scenario_of(four()).config("u"), sweep=area)
     whole = area.path(ends, R)
-    finder = RobotState(config, task=Covering(whole), agenda=Agenda(strips_end=ends[1]))
+    finder = RobotState(config, task=Covering(whole), strips_end=ends[1])
     told = strips(finder)
     assert told == ends
     beyond = (first, area.strips(R) + more)
@@ -233,7 +232,7 @@ def test_reports_in_another_order_lead_to_the_same_claim_to_the_bit() -> None:
     for seed in range(100):
         random.Random(seed).shuffle(early)
         state = planner.decide(planner.decide(observed, [*early, *early]), [last])
-        claims.append(state.agenda.robot_verdict)
+        claims.append(state.robot_verdict)
     assert isinstance(claims[0], Localised)
     assert claims == claims[:1] * 100
 

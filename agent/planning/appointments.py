@@ -8,7 +8,7 @@ from msgspec.structs import replace
 
 from agent.estimation.knowledge import MeetingPosterior
 from agent.peer.peer_state import PeerState
-from agent.planning import phase2_orbit, searching, visit
+from agent.planning import phase2_orbit, searching, travelling
 from agent.planning.state import RobotState
 from agent.planning.tasks import Asleep, Orbital, Travelling
 from protocol.messages import Appointment, Member, Undecided, Verdict
@@ -27,24 +27,24 @@ def next_visit(state: RobotState) -> RobotState:
     and has not reported it; of those that were not beside their anchors, the one for which that was longest
     ago. After all these, the robot covers the parts of others.
     """
-    visits, config = state.agenda.visits, state.config
+    visits, config = state.visits, state.config
     while visits < len(config.visits):
         peer = config.visits[visits]
         visits += 1
         if not (state.other(peer).localised or state.other(peer).failed):
-            return on_visit(state.with_agenda(visits=visits), peer)
-    state = state.with_agenda(visits=visits)
+            return on_visit(replace(state, visits=visits), peer)
+    state = replace(state, visits=visits)
     if config.confirms:
         return at_anchor(state)
     seeks = searching.wanted(state)
-    if seeks and state.agenda.parts == 0:
+    if seeks and state.parts == 0:
         return searching.next_part(state)
-    here, tick = compose(state.agenda.frame, state.odometry), state.tick
+    here, tick = compose(state.frame, state.odometry), state.tick
     late = [
         (state.other(one.robot).missed, math.hypot(one.anchor.x - here.x, one.anchor.y - here.y), one.robot)
         for one in config.members
         if one.ends < tick and one.robot != config.robot and _is_late(state, one)  # few are
-        if not seeks or state.other(one.robot).missed < state.agenda.part_tick  # one tour after each part
+        if not seeks or state.other(one.robot).missed < state.part_tick  # one tour after each part
     ]
     if late:
         return on_visit(state, min(late)[2])
@@ -70,12 +70,12 @@ def _is_late(state: RobotState, member: Member) -> bool:
 def on_visit(state: RobotState, peer: str) -> RobotState:
     """Return `state` of a localised robot that drives to `peer`."""
     state = _in_meeting(state, peer, "a")
-    return state.doing(Travelling(visit.stop(state))).with_agenda(visiting=True)
+    return replace(state, task=Travelling(travelling.stop(state)), visiting=True)
 
 
 def at_anchor(state: RobotState) -> RobotState:
     """Return `state` of a robot that returns to its anchor, and waits for any visitor."""
-    return waiting(state, state.config.peer).with_agenda(alone=True)
+    return replace(waiting(state, state.config.peer), alone=True)
 
 
 def after_failure(state: RobotState) -> RobotState:
@@ -86,15 +86,15 @@ def after_failure(state: RobotState) -> RobotState:
     """
     config = state.config
     if state.own_anchor.done_tick is None:
-        return state.with_agenda(robot_verdict=state.verdict)
+        return replace(state, robot_verdict=state.verdict)
     now, others = state.elapsed, [one.robot for one in config.members if one.robot != config.robot]
     if now >= config.gives_up or (state.verdict is None and all(state.other(one).failed for one in others)):
         late = Undecided(f"not localised after {now:g} s")
-        return state.with_agenda(robot_verdict=state.verdict or state.agenda.failure or late)
+        return replace(state, robot_verdict=state.verdict or state.failure or late)
     if state.verdict is not None:
         state = resumed(parted(state, state.verdict))
     elif _has_orbited(state) and (not state.in_contact or is_silent(state)):
-        state = waiting(state.with_agenda(until=None), config.peer)
+        state = waiting(replace(state, until=None), config.peer)
     return _trying_again(state)
 
 
@@ -106,17 +106,17 @@ def _has_orbited(state: RobotState) -> bool:
     config = state.config
     if config.role != "a":
         return False
-    if state.agenda.until is not None:
-        return state.elapsed >= state.agenda.until
+    if state.until is not None:
+        return state.elapsed >= state.until
     return state.tick > config.member(config.robot).ends
 
 
 def _trying_again(state: RobotState) -> RobotState:
     """Return `state` of a robot that is not localised, in the retry whose time has come."""
-    config, number = state.config, state.agenda.retries
+    config, number = state.config, state.retries
     if number >= len(config.retries) or state.elapsed < config.retries[number].begins:
         return state
-    retry, state = config.retries[number], state.with_agenda(retries=number + 1)
+    retry, state = config.retries[number], replace(state, retries=number + 1)
     # with its peer, which it has only been near so far, the robot meets in the roles of the retry
     peer = retry.peer_of(config.robot)
     begun = peer != config.peer or state.peer_state.latest >= 0
@@ -128,8 +128,8 @@ def _trying_again(state: RobotState) -> RobotState:
 def resumed(state: RobotState) -> RobotState:
     """Return `state` of a robot whose meeting has failed: in the retry that it has left, or waiting."""
     config = state.config
-    if state.agenda.retries and state.agenda.fix is None:
-        retry = config.retries[state.agenda.retries - 1]
+    if state.retries and state.fix is None:
+        retry = config.retries[state.retries - 1]
         if not refused(state, retry.peer_of(config.robot)) and state.elapsed < retry.begins + retry.lasts:
             return _in_retry(state, retry)
     return waiting(state, config.peer)
@@ -139,8 +139,8 @@ def _in_retry(state: RobotState, retry: Appointment) -> RobotState:
     """Return `state` in the meeting of `retry`, which has begun."""
     if retry.visited == state.config.robot:
         return waiting(state, retry.visitor, retry.rendezvous)
-    until = retry.begins + retry.lasts
-    return _aligned(_in_meeting(state, retry.visited, "a", retry.rendezvous)).with_agenda(until=until)
+    meeting = _in_meeting(state, retry.visited, "a", retry.rendezvous)
+    return replace(_aligned(meeting), until=retry.begins + retry.lasts)
 
 
 def waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> RobotState:
@@ -152,7 +152,7 @@ def waiting(state: RobotState, peer: str, orbits: Rendezvous | None = None) -> R
 
 def _aligned(state: RobotState) -> RobotState:
     """Return `state` on the way to its orbit or waiting place; a planner of the user drives there itself."""
-    if state.agenda.own is not None:
+    if state.own_state is not None:
         return state
     return phase2_orbit.continued(state)
 
@@ -168,19 +168,23 @@ def _in_meeting(state: RobotState, peer: str, role: Role, orbits: Rendezvous | N
         peer_state=PeerState(),
         task=Asleep(),
         plan=None,
-    ).with_agenda(meeting=state.agenda.meeting + 1, alone=False, visiting=False, parting=0, silence=0)
+        meeting=state.meeting + 1,
+        alone=False,
+        visiting=False,
+        parting=0,
+        silence=0,
+    )
 
 
 def parted(state: RobotState, failure: Verdict | None = None) -> RobotState:
     """Return `state` of a robot whose meeting has failed, by `failure`, and which meets its peer no more."""
     failed = state.with_other(state.config.peer, failed=True)
-    return failed.with_agenda(failure=failure) if failure is not None else failed
+    return replace(failed, failure=failure) if failure is not None else failed
 
 
 def withdrawn(state: RobotState, peer: str, failure: Verdict) -> RobotState:
     """Return `state` after `failure`: the pose is unknown again, and the meeting with `peer` has failed."""
-    failed = state.with_other(peer, failed=True)
-    return failed.with_agenda(robot_verdict=None, fix=None, failure=failure)
+    return replace(state.with_other(peer, failed=True), robot_verdict=None, fix=None, failure=failure)
 
 
 def is_met(state: RobotState) -> bool:
@@ -191,14 +195,14 @@ def is_met(state: RobotState) -> bool:
     config = state.config
     if not state.in_contact or is_silent(state) or refused(state, config.peer):
         return False
-    until = state.agenda.until if state.agenda.until is not None else 0.0
+    until = state.until if state.until is not None else 0.0
     is_noisy, ends = state.estimator.corrects_poses, config.member(config.robot).ends
     return not is_noisy or state.tick <= ends or state.elapsed < until
 
 
 def is_silent(state: RobotState) -> bool:
     """Return whether this robot takes its peer, which is in range, for lost."""
-    return state.agenda.silence > PEER_LOST_AFTER
+    return state.silence > PEER_LOST_AFTER
 
 
 def refused(state: RobotState, robot: str) -> bool:

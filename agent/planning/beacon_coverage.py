@@ -66,7 +66,7 @@ SMALLEST_LOSS = 1e-6
 
 def with_pose(state: RobotState, peer: str, report: Report) -> Report:
     """Return `report` with the pose at the begin of this contact, if there is one, and the log since then."""
-    reference = state.agenda.own_pose.reference
+    reference = state.own_pose.reference
     if reference is None:
         return report
     since = max(reference.tick, min(state.other(peer).acknowledged, state.log.through))
@@ -79,22 +79,22 @@ def beacon(state: RobotState) -> str | None:
 
     A beacon stays where it is: it covers no part, and its planned meetings are over.
     """
-    config, agenda = state.config, state.agenda
+    config = state.config
     if state.covers:
         return config.peer
-    if config.sweep is None or config.part < config.sweep.parts or agenda.visits < len(config.visits):
+    if config.sweep is None or config.part < config.sweep.parts or state.visits < len(config.visits):
         return None
-    is_known = isinstance(state.verdict, Localised) and isinstance(agenda.robot_verdict, Localised)
+    is_known = isinstance(state.verdict, Localised) and isinstance(state.robot_verdict, Localised)
     return config.robot if is_known else None
 
 
 def begun(state: RobotState, part: int) -> RobotState:
     """Return `state` at the begin of the coverage of a part. A beacon covers none, and stays where it is."""
-    config, fix = state.config, state.agenda.fix
+    config, fix = state.config, state.fix
     assert config.sweep is not None
     if config.part >= config.sweep.parts:
-        assert state.agenda.robot_verdict is not None
-        return state.doing(Done(3, state.agenda.robot_verdict))
+        assert state.robot_verdict is not None
+        return state.doing(Done(3, state.robot_verdict))
     assert fix is not None
     known = fix.known
     # after a visit in vain, or one that contradicts what this robot knows
@@ -107,11 +107,11 @@ def begun(state: RobotState, part: int) -> RobotState:
             posterior=known.posterior,
             peer_state=known.peer_state,
         )
-    due = replace(state.agenda.own_pose, estimated_tick=None, reference=None)
-    state = updated(state.with_agenda(own_pose=due))
+    due = replace(state.own_pose, estimated_tick=None, reference=None)
+    state = updated(replace(state, own_pose=due))
     anchor, beacon = state.config.anchor, beacon_place(state)
     path = surveyed_path(config.sweep, part, config.mission.sensing_range, (anchor.x, anchor.y), beacon)
-    return state.doing(Covering(transformed(inverse(state.agenda.frame), path)))
+    return state.doing(Covering(transformed(inverse(state.frame), path)))
 
 
 def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
@@ -134,8 +134,8 @@ def after_tick(state: RobotState, helped: Sequence[str]) -> RobotState:
 def _with_contact(state: RobotState, helped: Sequence[str]) -> RobotState:
     """Return `state` with a reference if a contact has begun in this tick, and without one at its end."""
     ticks = [ticks_since(state, one) for one in helped]
-    latest = state.agenda.own_pose.searched_tick
-    if state.agenda.own_pose.reference is not None:
+    latest = state.own_pose.searched_tick
+    if state.own_pose.reference is not None:
         return _with_reference(state, None) if all(since > LINGER for since in ticks) else state
     if 0 not in ticks or (latest is not None and state.tick - latest <= LINGER):
         return state
@@ -144,7 +144,7 @@ def _with_contact(state: RobotState, helped: Sequence[str]) -> RobotState:
 
 
 def _with_reference(state: RobotState, reference: ReportedPose | None) -> RobotState:
-    return state.with_agenda(own_pose=replace(state.agenda.own_pose, reference=reference))
+    return replace(state, own_pose=replace(state.own_pose, reference=reference))
 
 
 def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
@@ -153,7 +153,7 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
     The ranges since the claim may have ruled out the hypothesis on which it rests. A claim from a single
     meeting is then withdrawn. If several meetings agree on the claim, there is no reference.
     """
-    fix = state.agenda.fix
+    fix = state.fix
     assert fix is not None
     off = fix.contradiction(Localised(reference.pose, reference.covariance), state)
     if off is None:
@@ -165,7 +165,7 @@ def _agreed(state: RobotState, reference: ReportedPose) -> RobotState:
 
 def _stops_for(state: RobotState, robot: str) -> bool:
     """Return whether this robot stops for `robot`: it has just passed it, and knows its own pose well."""
-    reference, mission = state.agenda.own_pose.reference, state.config.mission
+    reference, mission = state.own_pose.reference, state.config.mission
     covariance = reference.covariance if reference is not None else None
     if covariance is None or covariance.position_sigma > WORTH * mission.accuracy:
         return False
@@ -186,7 +186,7 @@ def _has_passed(ranges: Sequence[Ranged], tick: int, near: float) -> bool:
 
 def updated(state: RobotState) -> RobotState:
     """Return `state` with a new estimate of the pose, if one is due."""
-    before = state.agenda.own_pose.estimated_tick
+    before = state.own_pose.estimated_tick
     ranged = bool(state.log.ranges) and state.log.ranges[-1].tick == state.tick
     ranged |= bool(state.mutual) and state.mutual[-1].tick == state.tick
     if before is not None and state.tick - before < (REFIT_WITH_RANGES if ranged else REFIT):
@@ -204,7 +204,7 @@ def searched(state: RobotState) -> tuple[RobotState, ReportedPose | None]:
     found, judged = followed_later("finder", state, _measured(state), searched=True)
     state = _with_estimate(state, found, judged)
     reference = _reference(state, judged)
-    return state.with_agenda(own_pose=replace(state.agenda.own_pose, searched_tick=state.tick)), reference
+    return replace(state, own_pose=replace(state.own_pose, searched_tick=state.tick)), reference
 
 
 def beacon_place(state: RobotState) -> Place:
@@ -220,19 +220,19 @@ def beacon_place(state: RobotState) -> Place:
 def _measured(state: RobotState) -> JointMeasurements:
     """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
     measured = pair_of(state)
-    claimed = state.agenda.fix.known.tick if state.agenda.fix is not None else -1
+    claimed = state.fix.known.tick if state.fix is not None else -1
     return measured.thinned_after(claimed, MOST_WEIGHED)
 
 
 def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judged | None) -> RobotState:
     """Return `state` with an estimate. The places to which the robot drives stay where they are in <W>."""
-    before = state.agenda.own_pose
+    before = state.own_pose
     if judged is None:
-        return state.with_agenda(own_pose=replace(before, estimated_tick=state.tick))
+        return replace(state, own_pose=replace(before, estimated_tick=state.tick))
     now = judged.localised
     assert now.covariance is not None
     framed = state.with_frame(now.pose)
-    turn, task = compose(inverse(framed.agenda.frame), state.agenda.frame), state.task
+    turn, task = compose(inverse(framed.frame), state.frame), state.task
     if isinstance(task, Covering):
         task = Covering(transformed(turn, task.places))
     elif isinstance(task, Looping):
@@ -247,12 +247,12 @@ def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judg
         sigma=now.covariance.position_sigma,
         ranges_when_lost=before.ranges if was_lost and ranges > before.ranges else before.ranges_when_lost,
     )
-    return replace(framed, posterior=posterior, task=task).with_agenda(own_pose=own_pose)
+    return replace(framed, posterior=posterior, task=task, own_pose=own_pose)
 
 
 def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:
     """Return the pose that was `judged` if the robot may report it (see `searched`); None if not."""
-    own_pose = state.agenda.own_pose
+    own_pose = state.own_pose
     if judged is not None and own_pose.ranges_when_lost is not None:
         required = own_pose.ranges_when_lost + RANGES_AGAIN
         judged = judged._replace(ranges=own_pose.ranges, required=required)

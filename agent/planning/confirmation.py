@@ -39,8 +39,8 @@ def onward(state: RobotState) -> RobotState:
 
 def _in_due_visit(state: RobotState) -> RobotState:
     """Return `state` on the visit whose time has come, or on the way back from one whose time is over."""
-    config, confirming, elapsed = state.config, state.agenda.confirming, state.elapsed
-    if state.agenda.visiting and confirming.until is not None:
+    config, confirming, elapsed = state.config, state.confirming, state.elapsed
+    if state.visiting and confirming.until is not None:
         if elapsed < confirming.until or state.verdict is not None:
             return state
         return appointments.at_anchor(state)
@@ -52,22 +52,22 @@ def _in_due_visit(state: RobotState) -> RobotState:
         confirming = replace(confirming, visits=confirming.visits + 1)
         if in_time and _may_confirm(state, visit.visited):
             confirming = replace(confirming, until=visit.begins + visit.lasts)
-            state = _with_frame(state).with_agenda(confirming=confirming)
+            state = replace(_with_frame(state), confirming=confirming)
             return appointments.on_visit(state, visit.visited)
-    return state.with_agenda(confirming=confirming)
+    return replace(state, confirming=confirming)
 
 
 def _is_free(state: RobotState) -> bool:
     """Return whether this robot knows a pose, waits beside its anchor, and is in no meeting."""
-    alone = state.agenda.alone or not state.in_contact or state.agenda.silence > MEETING_OVER_AFTER
-    return state.agenda.fix is not None and state.waits and alone
+    alone = state.alone or not state.in_contact or state.silence > MEETING_OVER_AFTER
+    return state.fix is not None and state.waits and alone
 
 
 def _may_confirm(state: RobotState, peer: str) -> bool:
     """Return whether a meeting with `peer` may confirm the pose of one of the two robots."""
     other = state.other(peer)
-    met = any(one.config.peer == peer for one in state.agenda.confirming.meetings)
-    return not (met or other.failed or (other.localised and state.agenda.robot_verdict is not None))
+    met = any(one.config.peer == peer for one in state.confirming.meetings)
+    return not (met or other.failed or (other.localised and state.robot_verdict is not None))
 
 
 def _with_frame(state: RobotState) -> RobotState:
@@ -76,11 +76,11 @@ def _with_frame(state: RobotState) -> RobotState:
     With a claim, it is the latest meeting of those that confirm it. Without one, meetings take turns from one
     visit to the next, because one of them may have been with an attacker, and lead astray.
     """
-    confirming = state.agenda.confirming
+    confirming = state.confirming
     poses = [pose for one in confirming.meetings if (pose := later_pose(one, state)) is not None]
     if not poses:
         return state
-    turn = 0 if state.agenda.robot_verdict is not None else confirming.visits % len(poses)
+    turn = 0 if state.robot_verdict is not None else confirming.visits % len(poses)
     return state.with_frame(poses[-1 - turn].pose)
 
 
@@ -89,36 +89,36 @@ def _with_frame(state: RobotState) -> RobotState:
 
 def _with_verdict(state: RobotState) -> RobotState:
     """Return `state` with a claim if enough meetings agree, or Undecided if the robot gives up."""
-    if state.agenda.robot_verdict is not None or state.agenda.fix is None:
+    if state.robot_verdict is not None or state.fix is None:
         return state
     config = state.config
     is_late = state.elapsed >= config.gives_up
     if is_late or _is_comparison_due(state):
         state = _confirmed(state)
-    if state.agenda.robot_verdict is not None or not is_late:
+    if state.robot_verdict is not None or not is_late:
         return state
-    met = ", ".join([one.config.peer for one in state.agenda.confirming.meetings])
+    met = ", ".join([one.config.peer for one in state.confirming.meetings])
     why = f"{config.tolerates + 1} robots must agree on its pose; it knows one by: {met}"
-    return state.with_agenda(robot_verdict=Undecided(why))
+    return replace(state, robot_verdict=Undecided(why))
 
 
 def _is_comparison_due(state: RobotState) -> bool:
     """Return whether the robot compares the poses of its meetings: after each, and beside its anchor."""
-    fix, ranges = state.agenda.fix, state.log.ranges
+    fix, ranges = state.fix, state.log.ranges
     if fix is not None and fix.known.tick == state.tick:
         return True
     if not (state.waits and ranges and ranges[-1].tick == state.tick):
         return False
-    return len(ranges) >= SHARE_AGAIN * state.agenda.confirming.ranges + RANGES_AGAIN
+    return len(ranges) >= SHARE_AGAIN * state.confirming.ranges + RANGES_AGAIN
 
 
 def _confirmed(state: RobotState) -> RobotState:
     """Return `state` with a claim that covers the poses of enough meetings which agree, if it is accurate."""
-    config, confirming = state.config, state.agenda.confirming
+    config, confirming = state.config, state.confirming
     needed = config.tolerates + 1
     if len(confirming.meetings) < needed:
         return state
-    state = state.with_agenda(confirming=replace(confirming, ranges=len(state.log.ranges)))
+    state = replace(state, confirming=replace(confirming, ranges=len(state.log.ranges)))
     poses = {one.config.peer: later_pose(one, state) for one in confirming.meetings}
     present_poses = [(peer, pose) for peer, pose in poses.items() if pose is not None]
     for chosen in combinations(present_poses, needed):
@@ -126,6 +126,6 @@ def _confirmed(state: RobotState) -> RobotState:
         if claim is not None:
             peers = [peer for peer, _ in chosen]
             meetings = sorted(confirming.meetings, key=lambda one: one.config.peer in peers)
-            confirming = replace(state.agenda.confirming, meetings=tuple(meetings))
-            return state.with_agenda(robot_verdict=claim, confirming=confirming).with_frame(claim.pose)
+            confirming = replace(state.confirming, meetings=tuple(meetings))
+            return replace(state, robot_verdict=claim, confirming=confirming).with_frame(claim.pose)
     return state

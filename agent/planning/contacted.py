@@ -77,7 +77,7 @@ class Contacted(msgspec.Struct, frozen=True):
                 found = replace(found, failure=why)
         found, claim = _estimated(state, found)
         if claim is not None:
-            return state.doing(Done(3, claim)).with_agenda(found=found)
+            return replace(state, task=Done(3, claim), found=found)
         return _moved_on(state, found)
 
     def answered(self, report: Report, peer: str) -> Report:
@@ -174,10 +174,10 @@ def _moved_on(state: RobotState, found: Contacted) -> RobotState:
     """Return `state` after a tick: in a loop while an accurate finder reports, else standing."""
     finder, mission = found.finder, state.config.mission
     if finder is None:
-        return state.doing(Awaiting()).with_agenda(found=found)
+        return replace(state, task=Awaiting(), found=found)
     if finder.latest <= state.tick - _kept(state):
-        return state.doing(Awaiting()).with_agenda(found=replace(found, finder=None, fit=None))
-    state = state.with_agenda(found=found)
+        return replace(state, task=Awaiting(), found=replace(found, finder=None, fit=None))
+    state = replace(state, found=found)
     if finder.covariance.position_sigma > mission.accuracy:
         return state.doing(Standing())
     if isinstance(state.task, Looping):

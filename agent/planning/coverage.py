@@ -68,7 +68,7 @@ def strips(state: RobotState) -> tuple[int, int] | None:
             left = len(then) - 1  # the first one is where it has left its strip
         case _:
             return None
-    end = state.agenda.strips_end
+    end = state.strips_end
     return None if end is None else (end - left // 2, end)
 
 
@@ -83,7 +83,7 @@ def without_strips(state: RobotState, others: tuple[int, int] | None) -> RobotSt
             task = Covering(places[:most])
         case Looping(_, then):
             task = replace(task, then=then[:most])
-    return state.doing(task).with_agenda(strips_end=others[0])
+    return replace(state, task=task, strips_end=others[0])
 
 
 def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
@@ -101,8 +101,8 @@ def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
     part = area.part_of(begin, reach)
     if first == end:  # it begins with the next part
         return replace(state, config=replace(state.config, part=part + 1))
-    state = state.with_agenda(parts=state.agenda.parts + 1)
-    state = along(replace(state, config=replace(state.config, part=part)), (first, end))
+    state = replace(state, parts=state.parts + 1, config=replace(state.config, part=part))
+    state = along(state, (first, end))
     assert isinstance(state.task, Covering)
     here = (state.odometry.x, state.odometry.y)
     return state.doing(Looping((), (here, *state.task.places), state.tick))
@@ -110,17 +110,17 @@ def second_half(state: RobotState, others: tuple[int, int]) -> RobotState:
 
 def along(state: RobotState, chosen: tuple[int, int]) -> RobotState:
     """Return `state` at the begin of the coverage of the strips `chosen`."""
-    config, agenda = state.config, state.agenda
+    config = state.config
     assert config.sweep is not None
     path = config.sweep.path(chosen, config.mission.sensing_range)
-    state = state.with_agenda(strips_end=None if state.config.tolerates else chosen[1])
-    return state.doing(Covering(transformed(inverse(agenda.frame), path)))
+    task = Covering(transformed(inverse(state.frame), path))
+    return replace(state, task=task, strips_end=None if config.tolerates else chosen[1])
 
 
 def with_pose(state: RobotState, peer: str, report: Report) -> Report:
     """Return `report` with the present pose of the robot, which is the same for each `peer`."""
     del peer
-    pose = exchange.reported_pose(state, state.agenda.frame)
+    pose = exchange.reported_pose(state, state.frame)
     return replace(report, prior=ReportedPose(state.tick, pose))
 
 

@@ -25,11 +25,11 @@ With more, a robot joins its orbit later; with 1, it turns to and fro about it.
 
 
 def controls(state: RobotState) -> Controls:
-    """Return the controls of the current task, or of the way aside (see `passing`) of a robot on its way."""
+    """Return the controls of the current task, or of a way aside (see `travelling`)."""
     task, odometry, mission = state.task, state.odometry, state.config.mission
     match task:
-        case tasks.Orbital() | tasks.Travelling() if state.agenda.passing.places:
-            return way_to(state, state.agenda.passing.places[0], backward=True) or REST
+        case tasks.Orbital() | tasks.Travelling() if state.passing.places:
+            return way_to(state, state.passing.places[0], backward=True) or REST
         case tasks.Orbiting():
             return task.command or state.config.orbit.controls
         case tasks.Aligning(heading) | tasks.Tangent(heading) | tasks.Turning(heading=heading):

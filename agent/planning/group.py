@@ -21,10 +21,9 @@ from agent.planning import (
     confirmation,
     exchange,
     meetings,
-    passing,
     plausibility,
     searching,
-    visit,
+    travelling,
 )
 from agent.planning.exchange import LogPlanner
 from agent.planning.meeting_planner import MeetingPlanner
@@ -67,16 +66,16 @@ class GroupPlanner(Planner[RobotState, Report]):
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, ranges to all robots of the group included."""
         before, state = state, self.pair_planner.observe(state, observation)
-        if state.in_contact and (before.agenda.alone or appointments.refused(before, state.config.peer)):
+        if state.in_contact and (before.alone or appointments.refused(before, state.config.peer)):
             state = replace(state, in_contact=False)
-        if state.agenda.visiting and _is_out_of_range_again(before, state):
-            state = state.doing(Travelling(visit.stop(state)))
-        state = passing.onward(state, observation.contacts)
-        if isinstance(state.task, Travelling) and not state.in_contact and not state.agenda.passing.places:
-            state = visit.searching(state)
-        lasting = state.agenda.parting if state.in_contact == before.in_contact else 0
+        if state.visiting and _is_out_of_range_again(before, state):
+            state = state.doing(Travelling(travelling.stop(state)))
+        state = travelling.onward(state, observation.contacts)
+        if isinstance(state.task, Travelling) and not state.in_contact and not state.passing.places:
+            state = travelling.searching(state)
+        lasting = state.parting if state.in_contact == before.in_contact else 0
         parting = lasting + 1 if isinstance(state.task, Done) else 0
-        return state if parting == state.agenda.parting else state.with_agenda(parting=parting)
+        return state if parting == state.parting else replace(state, parting=parting)
 
     def report(self, state: RobotState) -> Report:
         """Return the report to the peer of the present meeting."""
@@ -87,23 +86,25 @@ class GroupPlanner(Planner[RobotState, Report]):
 
         Until this robot is localised, one with which its meeting has failed gets the verdict of that meeting.
         """
-        if (found := state.agenda.found) is not None and not searching.takes_part(state):
-            return found.answered(exchange.report_without_log(state, state.agenda.robot_verdict), peer)
+        if (found := state.found) is not None and not searching.takes_part(state):
+            return found.answered(exchange.report_without_log(state, state.robot_verdict), peer)
         if searching.is_helped(state, peer):
             return searching.outside_meeting(state, peer)
         if appointments.refused(state, peer):
-            report = exchange.report_without_log(state, state.agenda.failure)
+            report = exchange.report_without_log(state, state.failure)
         elif (state.meets and peer == state.config.peer) or peer == searching.beacon(state):
             return self.report(state)
         else:
             report = searching.outside_meeting(state, peer)
-        unconfirmed = state.config.confirms and state.agenda.fix is not None and report.verdict is None
+        unconfirmed = state.config.confirms and state.fix is not None and report.verdict is None
         return replace(report, state=UNCONFIRMED) if unconfirmed else report
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the `reports` of others, and in the next meeting if this one has ended."""
-        if state.agenda.found is not None:
+        if state.found is not None:
             return self.pair_planner.decide(state, reports)
+        for one in reports:
+            state = meetings.with_sender(state, one)
         if searching.is_apart(state):
             return self._apart(state, reports)
         state = self._met(state, reports)
@@ -111,8 +112,6 @@ class GroupPlanner(Planner[RobotState, Report]):
 
     def _met(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` with the decisions of the present meeting, or in the next one if it has ended."""
-        for one in reports:
-            state = meetings.with_sender(state, one)
         anchored = [one.robot for one in state.config.members]
         logs = [one for one in reports if one.has_log and one.robot in anchored]  # others are in no meeting
         visitors = [one.robot for one in logs if one.state == Travelling.name]
@@ -123,9 +122,9 @@ class GroupPlanner(Planner[RobotState, Report]):
         state = self.pair_planner.decide(before, of_peer)
         if before.verdict is None and state.verdict is not None and state.own_anchor.done_tick is None:
             return appointments.parted(before, state.verdict)  # it goes on with phase 1
-        silence = state.agenda.silence + 1 if state.in_contact and not of_peer else 0
-        if silence != state.agenda.silence:
-            state = state.with_agenda(silence=silence)
+        silence = state.silence + 1 if state.in_contact and not of_peer else 0
+        if silence != state.silence:
+            state = replace(state, silence=silence)
         if isinstance(state.verdict, Localised) and before.verdict is None:
             state = meetings.with_pose(state, state.verdict)
         refusals = [one for one in reports if one.robot == peer and not one.has_log]
@@ -142,7 +141,6 @@ class GroupPlanner(Planner[RobotState, Report]):
     def _apart(self, state: RobotState, reports: Sequence[Report]) -> RobotState:
         """Return `state` of a robot that is in no meeting, with the `reports` of others, and one tick on."""
         for one in reports:
-            state = meetings.with_sender(state, one)
             state = state.with_other(one.robot, acknowledged=one.heard)  # if overtaken, more is sent again
         of_peer = [one for one in reports if one.has_log and one.robot == state.config.peer]
         heard = plausibility.with_reports(state, of_peer, self.pair_planner.rendezvous)
@@ -155,9 +153,9 @@ class GroupPlanner(Planner[RobotState, Report]):
         rests, config = meetings.rests(state), state.config
         meets = state.meets and not rests
         command = self.pair_planner.command(state)
-        verdict = state.agenda.robot_verdict
+        verdict = state.robot_verdict
         unconfirmed = config.confirms and verdict is None and isinstance(state.verdict, Localised)
-        controls = passing.limited(Controls(command.v, command.omega), state.agenda.passing, config.mission)
+        controls = travelling.limited(Controls(command.v, command.omega), state.passing, config.mission)
         return replace(
             command,
             v=controls.v,
@@ -176,12 +174,12 @@ class GroupPlanner(Planner[RobotState, Report]):
         planner does not compute how the noise of the odometry adds up.
         """
         estimate, latest = self.pair_planner.estimate(state), state.verdict
-        if state.agenda.fix is None:
+        if state.fix is None:
             return estimate
         return replace(
             estimate,
-            world=(compose(state.agenda.frame, state.odometry),),
-            localised=isinstance(state.agenda.robot_verdict, Localised),
+            world=(compose(state.frame, state.odometry),),
+            localised=isinstance(state.robot_verdict, Localised),
             probabilities=(),
             covariance=latest.covariance if isinstance(latest, Localised) else None,
         )

@@ -14,15 +14,14 @@ from msgspec.structs import replace
 
 from agent.peer import peer_state
 from agent.planning import drive, exchange
-from agent.planning.agenda import Agenda
 from agent.planning.planner import Planner, Summary
+from agent.planning.report_bodies import decoded
 from agent.planning.state import RobotState
 from agent.planning.tasks import Asleep, Deciding, Done, Travelling
 from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
 from protocol.mission import Mission
 from protocol.motion import Controls
-
-_encoder = msgspec.msgpack.Encoder()
+from protocol.wire import MalformedFrame
 
 
 class MeetingPlanner(Planner[RobotState, Report]):
@@ -33,21 +32,20 @@ class MeetingPlanner(Planner[RobotState, Report]):
     def __init__(self, planner: Planner[Any, Any]) -> None:
         """`planner` defines `meet`."""
         self._planner = planner
-        self._decoder = msgspec.msgpack.Decoder(planner.BODY)
         self.REQUIRED_PLACES = planner.REQUIRED_PLACES
 
     # --- decisions ---
 
     def start(self, config: RobotConfig) -> RobotState:
         """Return the state of a robot that has measured nothing yet."""
-        return RobotState(config, agenda=Agenda(own=(0, self._planner.start(config))))
+        return RobotState(config, own_state=(0, self._planner.start(config)))
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick; the planner of the user gets those of its peer."""
         state = exchange.observed(state, observation)
         contacts = tuple([one for one in observation.contacts if one.peer == state.config.peer])
         own = self._planner.observe(self._own(state), replace(observation, contacts=contacts))
-        return state.with_agenda(own=(state.agenda.meeting, own))
+        return replace(state, own_state=(state.meeting, own))
 
     def report(self, state: RobotState) -> Report:
         """Return the report to the peer: that of the user's planner, and what the group has to know."""
@@ -59,7 +57,7 @@ class MeetingPlanner(Planner[RobotState, Report]):
             state=state.task.name,
             heard=max(state.peer_state.latest, 0),
             verdict=state.verdict,
-            body=_encoder.encode(body),
+            body=msgspec.msgpack.encode(body),
         )
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
@@ -67,9 +65,9 @@ class MeetingPlanner(Planner[RobotState, Report]):
         peer = state.peer_state
         for one in reports:
             peer = peer_state.with_report(peer, one)
-        bodies = [self._decoder.decode(one.body) for one in reports if one.body is not None]
+        bodies = [decoded(one, self._planner) for one in reports if one.body is not None]
         own = self._planner.decide(self._own(state), bodies)
-        state = replace(state, peer_state=peer).with_agenda(own=(state.agenda.meeting, own))
+        state = replace(state, peer_state=peer, own_state=(state.meeting, own))
         if isinstance(state.task, Done) or (isinstance(state.task, Travelling) and not state.in_contact):
             return state
         command, known = self._planner.command(own), state.own_anchor
@@ -95,8 +93,8 @@ class MeetingPlanner(Planner[RobotState, Report]):
 
     def _own(self, state: RobotState) -> Any:
         """Return the state of the user's planner in the present meeting."""
-        number, own = state.agenda.own
-        return own if number == state.agenda.meeting else self._planner.meet(own, state.config)
+        number, own = state.own_state
+        return own if number == state.meeting else self._planner.meet(own, state.config)
 
     # --- optional ---
 
@@ -105,9 +103,9 @@ class MeetingPlanner(Planner[RobotState, Report]):
         if body.body is None:
             return None if not body.has_log else "a log, and this robot's planner has reports of its own"
         try:
-            return self._planner.malformed(self._decoder.decode(body.body))
-        except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-            return f"its body: {error}"
+            return self._planner.malformed(decoded(body, self._planner))
+        except MalformedFrame as error:
+            return str(error)
 
     def summary(self, state: RobotState) -> Summary:
         """Return the numbers of the user's planner."""
@@ -117,7 +115,7 @@ class MeetingPlanner(Planner[RobotState, Report]):
         """Return how a report contradicts the robot's own measurements; None if it does not."""
         if body.body is None:
             return None
-        return self._planner.misreport(self._decoder.decode(body.body), observations)
+        return self._planner.misreport(decoded(body, self._planner), observations)
 
     def required_mutual_ranges(self, mission: Mission) -> int:
         """Return the minimum number of noisy mutual ranges before a claim."""

@@ -6,9 +6,8 @@ from collections.abc import Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import appointments, coverage, searching, visit
-from agent.planning.agenda import Fix
-from agent.planning.state import RobotState
+from agent.planning import appointments, coverage, searching, travelling
+from agent.planning.state import Fix, RobotState
 from agent.planning.tasks import UNCONFIRMED, Done, Travelling
 from protocol.messages import Localised, Report, Undecided
 
@@ -45,7 +44,7 @@ def answering(state: RobotState, visitors: Sequence[str]) -> RobotState:
     if not state.waits or state.own_anchor.done_tick is None:
         return state
     peer = state.config.peer
-    if peer in visitors and not (state.agenda.alone or appointments.refused(state, peer)):
+    if peer in visitors and not (state.alone or appointments.refused(state, peer)):
         # a robot that searches for its peer must not wait for that one's manoeuvre while it waits for its own
         return appointments.waiting(state, peer) if state.config.role == "a" else state
     if appointments.is_met(state):
@@ -64,21 +63,19 @@ def with_pose(state: RobotState, claim: Localised) -> RobotState:
     single meeting is withdrawn, because nothing tells which of the two it was, and the robot waits for a
     third one. A planner of the user claims its pose once.
     """
-    agenda, peer, known = state.agenda, state.config.peer, state.knowledge
-    fix = agenda.fix
-    if agenda.own is not None and fix is not None:
+    fix, peer, known = state.fix, state.config.peer, state.knowledge
+    if state.own_state is not None and fix is not None:
         return state
     if state.config.confirms:
-        earlier = [one for one in agenda.confirming.meetings if one.config.peer != peer]
-        confirming = replace(agenda.confirming, meetings=(*earlier, known))
+        earlier = [one for one in state.confirming.meetings if one.config.peer != peer]
+        confirming = replace(state.confirming, meetings=(*earlier, known))
         fix = Fix(known, claim, (peer,))
-        return state.with_agenda(fix=fix, confirming=confirming).with_frame(claim.pose)
+        return replace(state, fix=fix, confirming=confirming).with_frame(claim.pose)
     state = state.with_other(peer, localised=True)
     off = fix.contradiction(claim, state) if fix is not None else None
     if off is None:
         fix = Fix(known, claim, (*(fix.peers if fix is not None else ()), peer))
-        state = state.with_agenda(fix=fix).with_frame(claim.pose)
-        return state if agenda.robot_verdict is not None else state.with_agenda(robot_verdict=claim)
+        return replace(state, fix=fix, robot_verdict=state.robot_verdict or claim).with_frame(claim.pose)
     assert fix is not None
     if len(fix.peers) > 1:
         return appointments.parted(state)
@@ -92,9 +89,9 @@ def _while_covering(state: RobotState) -> RobotState:
 
     Without it, the robot waits for another one than its peer.
     """
-    agenda, peer = state.agenda, state.config.peer
-    assert agenda.robot_verdict is not None
-    covered, done = searching.after_tick(state), Done(state.phase, agenda.robot_verdict)
+    assert state.robot_verdict is not None
+    peer, done = state.config.peer, Done(state.phase, state.robot_verdict)
+    covered = searching.after_tick(state)
     if covered.verdict is None:
         return appointments.next_visit(covered.doing(done)) if coverage.is_over(covered) else covered
     return appointments.waiting(appointments.withdrawn(covered, peer, covered.verdict), peer)
@@ -102,7 +99,7 @@ def _while_covering(state: RobotState) -> RobotState:
 
 def after_refusal(state: RobotState) -> RobotState:
     """Return `state` of a robot whose peer has ended their meeting, because it contradicts what it knows."""
-    if state.agenda.visiting:
+    if state.visiting:
         return appointments.next_visit(appointments.parted(state))
     why = Undecided(f"{state.config.peer} does not go on with the meeting")
     failed = appointments.parted(state, why)
@@ -114,20 +111,20 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
 
     `peer_has_left` says that the peer has a result, and has reported it from outside the meeting.
     """
-    agenda, peer = state.agenda, state.config.peer
+    peer = state.config.peer
     over = peer_has_left or _is_over(state)
-    if agenda.fix is None and agenda.robot_verdict is None and isinstance(state.verdict, Localised):
+    if state.fix is None and state.robot_verdict is None and isinstance(state.verdict, Localised):
         # it contradicts an earlier meeting
-        parted = appointments.parted(state).with_agenda(visiting=False)
+        parted = replace(appointments.parted(state), visiting=False)
         return appointments.waiting(parted, peer) if over else state
-    if agenda.fix is None:
+    if state.fix is None:
         return appointments.after_failure(state)
     if state.covers:
         return _while_covering(state)
-    if agenda.visiting and state.verdict is None:
-        if state.other(peer).localised and agenda.robot_verdict is not None:  # by another robot
+    if state.visiting and state.verdict is None:
+        if state.other(peer).localised and state.robot_verdict is not None:  # by another robot
             return appointments.next_visit(state)
-        if visit.has_searched(state):
+        if travelling.has_searched(state):
             return appointments.next_visit(state.with_other(peer, missed=state.tick))
         if appointments.is_silent(state):
             return appointments.next_visit(appointments.parted(state))
@@ -135,22 +132,22 @@ def onward(state: RobotState, *, peer_has_left: bool = False) -> RobotState:
     if not isinstance(state.task, Done) or _must_linger(state):
         return state
     if not isinstance(state.verdict, Localised):
-        reported = agenda.parting > 0 or not state.in_contact  # to the peer, before this robot leaves
+        reported = state.parting > 0 or not state.in_contact  # to the peer, before this robot leaves
         return appointments.next_visit(appointments.parted(state)) if reported else state
     return appointments.next_visit(state) if over else state
 
 
 def _is_over(state: RobotState) -> bool:
     """Return whether the peer has a result in the present meeting, or is not there any more."""
-    has_left = state.agenda.parting >= PARTED_AFTER and not state.in_contact
+    has_left = state.parting >= PARTED_AFTER and not state.in_contact
     return has_left or appointments.is_silent(state) or state.peer_state.verdict is not None
 
 
 def rests(state: RobotState) -> bool:
     """Return whether the robot has its result, its meeting is over, and it has no robot to drive to."""
-    if state.agenda.robot_verdict is None or not isinstance(state.task, Done) or _must_linger(state):
+    if state.robot_verdict is None or not isinstance(state.task, Done) or _must_linger(state):
         return False
-    return state.agenda.alone or _is_over(state)
+    return state.alone or _is_over(state)
 
 
 def _must_linger(state: RobotState) -> bool:
@@ -161,4 +158,4 @@ def _must_linger(state: RobotState) -> bool:
     if not state.config.mission.safety_distance or state.config.role == "a" or not state.in_contact:
         return False
     travels = state.other(state.config.peer).travels
-    return state.agenda.parting < (appointments.PEER_LOST_AFTER if travels else LINGERING)
+    return state.parting < (appointments.PEER_LOST_AFTER if travels else LINGERING)

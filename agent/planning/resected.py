@@ -80,7 +80,7 @@ class Resected(msgspec.Struct, frozen=True):
                     places[key] = RangedPlace((prior.pose.x, prior.pose.y), moved, one.range)
         if places.keys() != self.places.keys():
             state, found = _resected(state, replace(self, places=places))
-            state = state.with_agenda(found=found)
+            state = replace(state, found=found)
         return _moved_on(state, found) if state.verdict is None else state
 
     def answered(self, report: Report, peer: str) -> Report:
@@ -172,4 +172,4 @@ def _moved_on(state: RobotState, found: Resected) -> RobotState:
     if latest > state.tick - KEPT and state.task.since > state.tick - LOOPS_FOR:
         return state.doing(coverage.looping(state, state.task.since))
     found = Resected(state.odometry, state.tick, unconfirmed=found.unconfirmed)
-    return state.doing(Standing() if found.unconfirmed else Awaiting()).with_agenda(found=found)
+    return replace(state, task=Standing() if found.unconfirmed else Awaiting(), found=found)

@@ -70,7 +70,7 @@ def takes_part(state: RobotState) -> bool:
     false data, its pose is not independent of those that have found it.
     """
     shares = not (state.estimator.corrects_poses or state.config.tolerates)
-    return shares and isinstance(state.agenda.robot_verdict, Localised)
+    return shares and isinstance(state.robot_verdict, Localised)
 
 
 def beacon(state: RobotState) -> str | None:
@@ -88,7 +88,7 @@ def outside_meeting(state: RobotState, peer: str) -> Report:
 
     A robot without an anchor gets the pose of a localised one until it has determined its own by it.
     """
-    verdict = state.agenda.robot_verdict
+    verdict = state.robot_verdict
     report = replace(exchange.report_without_log(state, verdict), strips=coverage.strips(state))
     if not (is_helped(state, peer) and isinstance(verdict, Localised)):
         return report
@@ -104,10 +104,8 @@ def next_part(state: RobotState) -> RobotState:
     assert config.sweep is not None
     for robot in config.unanchored:
         state = state.with_other(robot, failed=False)
-    part = (config.part + state.agenda.parts) % config.sweep.parts
-    state = state.with_agenda(
-        parts=state.agenda.parts + 1, part_tick=state.tick, visiting=False, parting=0, silence=0
-    )
+    part = (config.part + state.parts) % config.sweep.parts
+    state = replace(state, parts=state.parts + 1, part_tick=state.tick, visiting=False, parting=0, silence=0)
     return steps_of(state).begun(state, part)
 
 

@@ -18,7 +18,7 @@ from agent.estimation.gaussian.search import position_sigma
 from agent.estimation.posterior import Hypothesis, certainties, same
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import TeamLog
-from agent.planning.agenda import Bypass
+from agent.planning.state import Bypass
 from protocol.coverage_strips import Place
 from protocol.messages import Localised, RobotConfig, SurveyedAnchor, Team, Undecided, Verdict
 from protocol.mission import Anchor

@@ -21,9 +21,9 @@ from agent.estimation.gaussian.search import of_anchor
 from agent.estimation.posterior import Hypothesis
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.drive import pursuit, towards
-from agent.planning.passing import limited, passed
 from agent.planning.strides import stride
 from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
+from agent.planning.travelling import limited, passed
 from protocol.coverage_ticks import coverage_speed
 from protocol.messages import Undecided
 from protocol.motion import REST, TAU, Controls, Pose
@@ -64,7 +64,7 @@ def next_task(state: TeamState) -> TeamState:
 
 
 def _passing_robots(state: TeamState) -> TeamState:
-    """Return `state` on its way past robots (see `passing`). It waits for those earlier in the team."""
+    """Return `state` on its way past robots (see `travelling`). It waits for those earlier in the team."""
     mission, passing = state.config.mission, state.passing
     if not mission.safety_distance:
         return state

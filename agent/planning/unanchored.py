@@ -36,23 +36,23 @@ class UnanchoredPlanner(LogPlanner):
         state = RobotState(config, task=Awaiting())
         if state.estimator.corrects_poses:
             library()  # it is needed when the robot is found, and would end the mission then
-        return state.with_agenda(found=searching.steps_of(state).found, alone=True)
+        return replace(state, found=searching.steps_of(state).found, alone=True)
 
     def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
         """Return `state` with the data in `reports`, and with a verdict if they determine the own pose.
 
         With exact sensors, a robot that is localised looks for the others without an anchor.
         """
-        if state.agenda.robot_verdict is None:
+        if state.robot_verdict is None:
             late = state.elapsed >= state.config.gives_up
             found = _found(state)
             state = state.undecided(found.why_undecided(state)) if late else found.informed(state, reports)
-            state = state if state.verdict is None else state.with_agenda(robot_verdict=state.verdict)
+            state = replace(state, robot_verdict=state.verdict)
         return _searching(state, reports) if searching.takes_part(state) else state
 
     def estimate(self, state: RobotState) -> Estimate:
         """Return the hypotheses in <W>."""
-        localised = isinstance(state.agenda.robot_verdict, Localised)
+        localised = isinstance(state.robot_verdict, Localised)
         return _found(state).estimate(state, replace(super().estimate(state), localised=localised))
 
     # --- optional ---
@@ -77,8 +77,8 @@ class UnanchoredPlanner(LogPlanner):
 
 def _found(state: RobotState) -> Resected | Contacted:
     """Return what a robot without an anchor knows by others."""
-    assert state.agenda.found is not None
-    return state.agenda.found
+    assert state.found is not None
+    return state.found
 
 
 def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:
@@ -88,7 +88,7 @@ def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:
     """
     for one in reports:
         state = meetings.with_sender(state, one)
-    if state.agenda.parts == 0:
+    if state.parts == 0:
         offered = [one.strips for one in reports if one.strips is not None]
         state = coverage.second_half(state, offered[0]) if offered else state
     if any(one.prior is not None for one in reports) and not isinstance(state.task, Covering):
@@ -97,6 +97,6 @@ def _searching(state: RobotState, reports: Sequence[Report]) -> RobotState:
         state = searching.after_tick(state)
         if not coverage.is_over(state):
             return state
-        assert state.agenda.robot_verdict is not None
-        state = state.doing(Done(3, state.agenda.robot_verdict))
+        assert state.robot_verdict is not None
+        state = state.doing(Done(3, state.robot_verdict))
     return searching.next_part(state) if searching.wanted(state) else state

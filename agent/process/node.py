@@ -16,12 +16,12 @@ from functools import partial
 
 import zenoh
 
+from agent.planning.report_bodies import malformed
 from agent.process.agent_journal import FramedReport
 from agent.process.discovery import NoWorld, Search, Unwelcome, confirm, join
 from agent.process.link import AgentLink
 from agent.process.out_of_step import OutOfStep
 from agent.process.recovery import OWN_REPORTS_KEPT, Memory
-from agent.process.report_bodies import malformed
 from agent.process.report_buffer import ReportBuffer
 from agent.process.robot import REPORTS_KEPT
 from protocol.messages import MissionEnd, Observation, RobotConfig, TickStart

@@ -9,8 +9,8 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from agent.planning.planner import Planner, Summary
+from agent.planning.report_bodies import body_of, report_of
 from agent.process.agent_journal import AgentHistory, FramedReport, Step
-from agent.process.report_bodies import body_of, report_of
 from protocol.journal import environment
 from protocol.journal.journal_file import Sink
 from protocol.messages import (

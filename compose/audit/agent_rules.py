@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from agent.planning.planner import Planner
+from agent.planning.report_bodies import body_of
 from agent.process.agent_journal import Step
-from agent.process.report_bodies import body_of
 from agent.process.robot import PlannerReplay, Robot
 from compose.audit.findings import Checks, Violation, unlike
 from compose.launch.planner_guard import beyond_limits

@@ -6,6 +6,7 @@ encoded, and sent in the field `body` of one.
 
 from __future__ import annotations
 
+from functools import cache
 from typing import Any
 
 import msgspec
@@ -13,10 +14,6 @@ import msgspec
 from agent.planning.planner import Planner
 from protocol.messages import Inconsistent, Report, Undecided, Verdict
 from protocol.wire import MalformedFrame
-
-_encoder = msgspec.msgpack.Encoder()
-_decoders: dict[Any, msgspec.msgpack.Decoder[Any]] = {}
-
 
 SHORT_REASON = 24
 """The maximum number of characters of a reason beside a body, so that most of a report is the body."""
@@ -34,7 +31,7 @@ def report_of(body: Any, tick: int, robot: str, heard: int = 0, verdict: Verdict
             verdict = Undecided(reason[:SHORT_REASON])
         case Inconsistent(claim, residual, p_value):
             verdict = Inconsistent(claim[:SHORT_REASON], residual, p_value)
-    return Report(tick, robot, heard=heard, verdict=verdict, body=_encoder.encode(body))
+    return Report(tick, robot, heard=heard, verdict=verdict, body=msgspec.msgpack.encode(body))
 
 
 def body_of(report: Report, planner: Planner[Any, Any]) -> Any:
@@ -42,17 +39,22 @@ def body_of(report: Report, planner: Planner[Any, Any]) -> Any:
 
     Raises MalformedFrame if it is not of the planner's type.
     """
-    if planner.BODY is Report:
-        return report
+    return report if planner.BODY is Report else decoded(report, planner)
+
+
+def decoded(report: Report, planner: Planner[Any, Any]) -> Any:
+    """Return what is encoded in `report`, of the type of the planner's bodies. Raises MalformedFrame."""
     if report.body is None:
         raise MalformedFrame("a report without a body, and this robot's planner has reports of its own")
-    decoder = _decoders.get(planner.BODY)
-    if decoder is None:
-        decoder = _decoders[planner.BODY] = msgspec.msgpack.Decoder(planner.BODY)
     try:
-        return decoder.decode(report.body)
+        return _decoder(planner.BODY).decode(report.body)
     except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
         raise MalformedFrame(f"its body: {error}") from None
+
+
+@cache
+def _decoder(body: Any) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(body)
 
 
 def malformed(report: Report, planner: Planner[Any, Any]) -> str | None:

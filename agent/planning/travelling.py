@@ -1,8 +1,11 @@
-"""The way of a robot past those that it does not meet, at the safety distance, by ranges alone.
+"""The way of a robot to another one: to the anchor beside which that one waits, and past all others.
 
-In each tick, a robot drives at most half of the way that is left to the safety distance, in any direction.
-Two robots that both do so keep it. On its way to another robot, or to its orbit and on it, a robot may then
-be blocked by another one, which stands there or is blocked itself: it drives back, then aside, and on.
+If the robot that it visits is not in range at the end of the way, a visitor searches across it.
+
+The way past those that it does not meet follows from ranges alone, and keeps the safety distance. In each
+tick, a robot drives at most half of the way that is left to the safety distance, in any direction. Two robots
+that both do so keep it. On its way to another robot, or to its orbit and on it, a robot may then be blocked
+by another one, which stands there or is blocked itself: it drives back, then aside, and on.
 
 A blocked robot waits only for those with a smaller id, so of robots that block each other the one with the
 smallest id never waits. The others wait for a few ticks at most: that one may not be on its way.
@@ -15,14 +18,89 @@ from collections.abc import Collection, Mapping, Sequence
 
 from msgspec.structs import replace
 
-from agent.planning import drive, phase2_orbit, separation, visit
-from agent.planning.agenda import Bypass
-from agent.planning.state import RobotState
+from agent.planning import drive, phase2_orbit, separation
+from agent.planning.drive import way_to
+from agent.planning.state import Bypass, RobotState
 from agent.planning.tasks import Orbital, Orbiting, Travelling, transformed
 from protocol.coverage_strips import Place
 from protocol.messages import Contact
 from protocol.mission import Mission
-from protocol.motion import Controls, Pose, compose
+from protocol.motion import Controls, Pose, compose, inverse
+from protocol.orbits import SEARCH_SIDES, SHORT_OF_ANCHOR, leg_end, search_legs
+
+# --- the way of a visitor ---
+
+SEARCHED_SIGMAS = 4.0
+"""The sigmas of the heading at the claim that a visitor's search allows for."""
+
+MOST_SIDES = 8
+"""The most sides of a search. They reach 14 R to either side, and are 128 R long."""
+
+
+def searching(state: RobotState) -> RobotState:
+    """Return `state` of a visitor out of range; if it has arrived, on the next leg of its search."""
+    assert isinstance(state.task, Travelling)
+    if way_to(state, state.task.place) is not None:
+        return state
+    begin, anchor = state.framed_at, _peer_anchor(state)
+    leg = next_leg(state.task, (begin.x, begin.y), (anchor.x, anchor.y), state.config.mission)
+    return state.doing(leg)
+
+
+def next_leg(
+    task: Travelling, begin: tuple[float, float], anchor: tuple[float, float], mission: Mission
+) -> Travelling:
+    """Return the leg after `task` of the search for a robot that waits beside `anchor` (see `leg_end`).
+
+    The robot knew its pose at `begin`. An error of its heading there turns the way about that place. So the
+    legs end on the arc about it that leads through the anchor. Both places are in m in the frame of the
+    odometry, in which the anchor is where it would be without that error.
+    """
+    leg, (dx, dy) = task.leg + 1, (anchor[0] - begin[0], anchor[1] - begin[1])
+    radius, aside = math.hypot(dx, dy), leg_end(leg) * mission.sensing_range
+    turned = min(max(aside / radius, -math.pi), math.pi) if radius else 0.0
+    bearing = math.atan2(dy, dx) + turned
+    return Travelling((begin[0] + radius * math.cos(bearing), begin[1] + radius * math.sin(bearing)), leg)
+
+
+def has_searched(state: RobotState) -> bool:
+    """Return whether the robot has searched for its peer in vain."""
+    task = state.task
+    return isinstance(task, Travelling) and task.leg > 0 and task.leg > search_legs(_search_sides(state))
+
+
+def _search_sides(state: RobotState) -> int:
+    """Return the number of sides of the search for the peer: with an inaccurate heading, more are necessary.
+
+    They reach SEARCHED_SIGMAS of the error that the heading at the claim has led to, to either side.
+    """
+    assert state.fix is not None
+    if state.fix.claim.covariance is None:
+        return 0
+    begin, anchor = state.framed_at, _peer_anchor(state)
+    sigma = state.fix.claim.covariance.heading_sigma
+    aside = SEARCHED_SIGMAS * sigma * math.hypot(anchor.x - begin.x, anchor.y - begin.y)
+    needed = 1 + math.ceil(0.5 * aside / state.config.mission.sensing_range)
+    return min(max(SEARCH_SIDES, needed), MOST_SIDES)
+
+
+def _peer_anchor(state: RobotState) -> Pose:
+    """Return the place of the peer's anchor, in m in the odometry's frame."""
+    peer_anchor = state.config.peer_anchor
+    return compose(inverse(state.frame), Pose(peer_anchor.x, peer_anchor.y, 0.0))
+
+
+def stop(state: RobotState) -> tuple[float, float]:
+    """Return the place of a visit, in m in the odometry's frame: on the way to the anchor, short of it."""
+    anchor = _peer_anchor(state)
+    dx, dy = anchor.x - state.odometry.x, anchor.y - state.odometry.y
+    distance = math.hypot(dx, dy)
+    short = SHORT_OF_ANCHOR * state.config.mission.sensing_range
+    share = 1.0 - short / distance if distance > short else 0.0
+    return state.odometry.x + share * dx, state.odometry.y + share * dy
+
+
+# --- past those that it does not meet ---
 
 RESERVE = 0.05
 """The way that a robot leaves unused, as a fraction of A_0, except on a way aside, which uses it.
@@ -55,25 +133,25 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
 
     A peer that does not go on with the meeting is passed like any other robot.
     """
-    mission, passing, task = state.config.mission, state.agenda.passing, state.task
+    mission, passing, task = state.config.mission, state.passing, state.task
     if not mission.safety_distance:
         return state
     met = state.config.peer if state.in_contact else None
     ranges = {one.peer: one.range for one in contacts if one.peer != met}
     stays = isinstance(task, Orbiting) and state.config.orbit.v == 0.0
     if stays or not isinstance(task, Travelling | Orbital):
-        return state.with_agenda(passing=Bypass(leeway(ranges, mission), detours=passing.detours))
+        return replace(state, passing=Bypass(leeway(ranges, mission), detours=passing.detours))
     if passing.places:  # what it does after the way aside begins where that ends
         on_visit = isinstance(task, Travelling)
-        state = state.doing(Travelling(visit.stop(state)) if on_visit else phase2_orbit.aligning(state))
-        if drive.way_to(state, passing.places[0], backward=True) is None:
+        state = state.doing(Travelling(stop(state)) if on_visit else phase2_orbit.aligning(state))
+        if way_to(state, passing.places[0], backward=True) is None:
             passing = replace(passing, places=passing.places[1:])
-            state = state.with_agenda(passing=passing)
+            state = replace(state, passing=passing)
     before = [one for one in ranges if one < state.config.robot]
     after = passed(passing, ranges, before, state.odometry, drive.controls(state), mission)
     if after.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
         after = replace(after, places=after.places[:2])  # its next task leads past the other robot
-    return state.with_agenda(passing=after)
+    return replace(state, passing=after)
 
 
 def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:
