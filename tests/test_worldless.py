@@ -23,7 +23,6 @@ from protocol.messages import Command, Message, OfRobot, Report
 from protocol.mission import Role
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests.commands import several_pairs, tandem
-from tests.doctor import complaints
 from tests.replays import exported_frames
 from tests.series import series
 from tests.test_album import drawn, line, pair
@@ -72,7 +71,6 @@ def test_an_export_of_hardware_mode_has_measurements_and_estimates_and_no_truth(
     assert {row["position_error_m"] for row in rows} == {None}
     assert any(row["position_error_m"] is not None for row in truly)
     assert set(exported_frames(alone)) == {"agent-a.journal", "agent-b.journal"}
-    assert complaints(alone / "run.mcap") == []
 
 
 @pytest.mark.long
