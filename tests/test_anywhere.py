@@ -17,7 +17,7 @@ from compose.sweep import spec
 from compose.sweep.cells import cells, trial_seed, trial_table
 from protocol.mission import Mission, infeasibility
 from protocol.rounding import TOLERANCE
-from tests.test_hard_starts import assert_localised
+from tests.test_random_starts import assert_localised
 
 ANYWHERE = spec.load("anywhere")
 (CELL,) = cells(ANYWHERE)

@@ -12,7 +12,7 @@ from playwright.sync_api import Page, expect
 from compose.launch import in_process
 from compose.scenario.scenario_file import load
 from tests.browser import INKS, Open, chromium_only, picture, shot, stop_clock, until_shown, watching
-from tests.test_page_labels import SIZES, overlaps
+from tests.test_accessibility import SIZES, overlaps
 
 STEP_MS = 250
 """The time in ms between two frames of the page."""

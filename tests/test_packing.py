@@ -1,4 +1,4 @@
-"""A distribution has the sources, and no key or recording that is in the tree beside them."""
+"""A distribution has the sources, and no key or recording beside them; its wheel works without a clone."""
 
 from __future__ import annotations
 
@@ -120,3 +120,33 @@ def test_a_wheel_works_without_a_clone(version: str, tree: Path, tmp_path: Path)
     ):
         ended = run([environment / "bin" / "tandem", *words.split()])
         assert ended.returncode == 0, ended.stderr
+
+
+OUTSIDE = {name: value for name, value in os.environ.items() if name not in ("PYTHONPATH", "VIRTUAL_ENV")} | {
+    "UV_PYTHON_DOWNLOADS": "never"
+}
+"""The environment of a process that finds nothing of the clone."""
+
+
+def uv(folder: Path, *arguments: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        ["uv", *arguments], cwd=folder, env=OUTSIDE, capture_output=True, text=True, check=False
+    )
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    return built(ROOT, "wheel", tmp_path_factory.mktemp("dist"))
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("version", ["3.11", "3.12", "3.13"])
+def test_the_wheel_runs_a_mission_in_an_empty_environment(version: str, wheel: Path, tmp_path: Path) -> None:
+    python = uv(tmp_path, "python", "find", "--no-project", version)
+    if python.returncode:
+        pytest.skip(f"there is no Python {version}")
+    run = ("tool", "run", "--isolated", "--python", python.stdout.strip(), "--from", str(wheel), "tandem")
+    for scenario, says in (("paper-1", "localised after 48 ticks\n"), ("noisy", "localised after ")):
+        ended = uv(tmp_path, *run, "run", scenario, "-q")
+        assert ended.returncode == 0, ended.stderr
+        assert ended.stdout.startswith(says)
