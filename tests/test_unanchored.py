@@ -47,7 +47,7 @@ from protocol.wire import decode, encode
 from tests.browser import Open, scrub_to, shot, watching
 from tests.commands import tandem as tandem_command
 from tests.groups import R, localised, table_of
-from tests.missions import kept
+from tests.missions import kept, outcome
 from tests.test_group_runs import audited, with_scenario
 from world.hardware.driver import Reading
 from world.hardware.measurements import observation_frame
@@ -103,8 +103,7 @@ def test_robots_without_an_anchor_are_localised_within_the_bound() -> None:
     scenario = scenario_of(four())
     run = run_mission(scenario)
     assert localised(run) == {"a", "b", "u", "v"}
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     assert last_claim(run) <= bound(scenario)
     for robot in scenario.unanchored:
         claim = run.claim(robot)
