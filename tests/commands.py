@@ -325,6 +325,14 @@ def size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
+def copied(recording: Path, folder: Path, *names: str) -> Path:
+    """Copy the journals of a recording, or those of these names, and return the folder, which may be new."""
+    folder.mkdir(exist_ok=True)
+    for path in [recording / name for name in names] or recording.glob("*.journal"):
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
 def in_one_process(scenario: str | Path, out: Path) -> Path:
     """Run a mission in one process, and return `out`, which is then its recording."""
     ended = tandem("run", scenario, "--in-process", "-q", "--out", out)

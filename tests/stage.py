@@ -16,15 +16,7 @@ import zenoh
 from msgspec.structs import replace
 
 from protocol.journal.journal_file import Sink
-from protocol.messages import (
-    Command,
-    FinalReport,
-    MissionEnd,
-    Observation,
-    RobotConfig,
-    TickStart,
-    Verdict,
-)
+from protocol.messages import Command, FinalReport, MissionEnd, Observation, RobotConfig, TickStart, Verdict
 from protocol.motion import REST
 from protocol.network import keys
 from protocol.network.clock import Clock

@@ -23,35 +23,11 @@ from compose.scenario.scenario_file import load, parse
 from compose.scenario.shipped_files import shipped
 from protocol.journal import journal_file
 from protocol.journal.journal_file import CorruptJournal, MemoryJournal
-from protocol.messages import (
-    Cause,
-    Command,
-    Estimate,
-    MissionEnd,
-    Observation,
-    Report,
-)
+from protocol.messages import Cause, Command, Estimate, MissionEnd, Observation, Report
 from protocol.wire import MAX_FRAME_BYTES, EncodedMessages, decode, encode
-from tests.commands import (
-    refused,
-    several_pairs,
-    tandem,
-)
+from tests.commands import refused, several_pairs, tandem
 from tests.missions import kept
-from tests.planted import (
-    LAST,
-    A,
-    B,
-    audit,
-    checks,
-    found,
-    messages,
-    of,
-    plant,
-    to,
-    what,
-    written,
-)
+from tests.planted import LAST, A, B, audit, checks, found, messages, of, plant, to, what, written
 from tests.series import series
 from tests.test_planted_violations import noise
 from world.scenario import Scenario

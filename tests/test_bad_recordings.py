@@ -17,15 +17,7 @@ from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_mcap import rows_as_they_arrive
 from compose.recording.ranging.range_recording import FixedAnchor
 from tests.commands import tandem as command
-from tests.mutated_recordings import (
-    End,
-    csv_text,
-    mcap_bytes,
-    pyfg_text,
-    recording,
-    summary,
-    trials,
-)
+from tests.mutated_recordings import End, csv_text, mcap_bytes, pyfg_text, recording, summary, trials
 from tests.range_tables import POSE, TABLES, Tables, refused, written_csv, written_mcap
 from tests.recording_mutations import Tables as Mutable
 from tests.test_house import HOUSE

@@ -32,9 +32,7 @@ from protocol.network.endpoints import LEASE_S, at
 from protocol.network.inbox import NO_ARRIVAL, Arrival, Inbox
 from protocol.wire import MAX_FRAME_BYTES, decode, encode
 from tests import test_field
-from tests.commands import (
-    ASSURED as TOLERANT,
-)
+from tests.commands import ASSURED as TOLERANT
 from tests.commands import (
     BOUND_S,
     ENDLESS,

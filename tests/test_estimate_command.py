@@ -23,9 +23,7 @@ from compose.recording.estimating.estimate_rows import PoseEstimateRow
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
 from compose.recording.estimating.recorded_measurements import EPOCH_S, measurements
 from compose.recording.ranging.range_files import read_ranges
-from compose.recording.ranging.range_recording import (
-    RangeRecording,
-)
+from compose.recording.ranging.range_recording import RangeRecording
 from compose.view.epochs import played, write_player
 from compose.view.played_estimate import PLAYER_JSON, read_player
 from compose.view.recorded import scenes as recorded_scenes

@@ -40,7 +40,7 @@ from protocol.journal import journal_file
 from protocol.messages import Estimate, Observation
 from protocol.motion import wrap
 from protocol.wire import decode
-from tests.commands import BOUND_S, TandemProcess, tandem
+from tests.commands import BOUND_S, TandemProcess, copied, tandem
 from tests.replays import exported_frames, killed
 from tests.series import series
 from world.referee import errors
@@ -334,10 +334,7 @@ def test_frames_are_rows_with_their_fields_by_name(faulty: Path) -> None:
 
 @pytest.mark.parametrize("name", [WORLD_JOURNAL, A])
 def test_a_torn_journal_is_exported_to_the_tear(name: str, faulty: Path, tmp_path: Path) -> None:
-    torn = tmp_path / "torn"
-    torn.mkdir()
-    for path in faulty.glob("*.journal"):
-        (torn / path.name).write_bytes(path.read_bytes())
+    torn = copied(faulty, tmp_path / "torn")
     size = (torn / name).stat().st_size * 2 // 3
     (torn / name).write_bytes((torn / name).read_bytes()[:size])
     frames = {path.name: len(list(journal_file.read(path))) for path in torn.glob("*.journal")}
@@ -358,8 +355,7 @@ def test_what_a_killed_process_leaves_is_exported_and_replayed(number: int, tmp_
 
 
 def test_a_robot_that_has_left_no_journal_is_named(paper_1: Path, tmp_path: Path) -> None:
-    for name in (WORLD_JOURNAL, A):
-        (tmp_path / name).write_bytes((paper_1 / name).read_bytes())
+    copied(paper_1, tmp_path, WORLD_JOURNAL, A)
     ended = tandem("export", tmp_path)
     assert (ended.status, ended.err) == (3, "tandem export: agent-b.journal is missing\n")
     assert set(exported_frames(tmp_path)) == {WORLD_JOURNAL, A}

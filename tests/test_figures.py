@@ -35,7 +35,7 @@ from compose.view.web.sources import Recorded
 from protocol.journal.journal_file import CorruptJournal
 from protocol.mission import ROLES
 from protocol.motion import Covariance, Pose
-from tests.commands import BENT, PAPER_1, Ended, refused, several_pairs, tandem
+from tests.commands import BENT, PAPER_1, Ended, copied, refused, several_pairs, tandem
 from tests.missions import outcome
 from tests.test_album import cut
 from tests.test_album import pair as pair_of
@@ -56,10 +56,6 @@ def drawn(noisy: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 def recorded(scenario: Scenario, folder: Path) -> Path:
     run_mission(scenario, folder)
     return folder
-
-
-def copied(recording: Path, folder: Path) -> Path:
-    return Path(shutil.copytree(recording, folder, dirs_exist_ok=True))
 
 
 def draw(folder: Path) -> Ended:

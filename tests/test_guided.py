@@ -157,8 +157,7 @@ PX_PER_M = """() => {
 
 @pytest.mark.long
 def test_the_camera_is_where_two_mirror_images_are_and_goes_back(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=1")
-    until_shown(page, 1)
+    page = opened(address, tick=1)
     expect(page.locator("#camera")).to_have_attribute("aria-pressed", "true")
     picture(page)
     near = page.evaluate(PX_PER_M) / 0.934
@@ -349,8 +348,7 @@ def test_the_server_tells_what_faults_cost_once_it_has_run_the_mission_without(
 
 
 def test_captions_do_not_tell_the_truth_if_it_is_hidden(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=48")
-    until_shown(page, 48)
+    page = opened(address, tick=48)
     expect(page.locator("#caption")).to_contain_text(
         "each knows its position and its heading. The claimed positions are off by"
     )
@@ -462,8 +460,7 @@ def labels(page: Page) -> dict[str, list[float]]:
 def test_both_first_distances_have_labels_and_no_name_lies_on_the_line_between_robots(
     opened: Open, address: str
 ) -> None:
-    page = opened(f"{address}#tick=0")
-    until_shown(page, 0)
+    page = opened(address, tick=0)
     assert {"2.68 m", "1.36 m"} <= labels(page).keys()
     for tick in (46, 47, 48):
         page.evaluate(f"location.hash = 'tick={tick}'")
@@ -494,8 +491,7 @@ def test_the_label_of_a_mutual_distance_goes_as_soon_as_the_robots_drive_on(
 def test_the_phase_of_a_planner_of_the_user_is_a_number(opened: Open, tmp_path: Path) -> None:
     run_mission(setting("paper-1", planner="tests.own_planners:Wrapping").scenario, tmp_path)
     with watching(tmp_path) as (_, found):
-        page = opened(f"{found}#tick=8")
-        until_shown(page, 8)
+        page = opened(found, tick=8)
         expect(page.locator(".card[data-robot=a] .phase")).to_have_text("phase 2")
         expect(page.locator(".card[data-robot=a]")).to_contain_text("a: radial")
         expect(page.locator("#legend")).to_contain_text("path, phase 1")
@@ -520,8 +516,7 @@ STROKES = """() => new Promise((drawn) => {
 
 @pytest.mark.long
 def test_all_seven_copies_of_a_path_have_the_colour_of_its_robot(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=5")
-    until_shown(page, 5)
+    page = opened(address, tick=5)
     picture(page)
     strokes = Counter(page.evaluate(STROKES))
     light = (PAGE / "style.css").read_text("utf-8").split("@media")[0]

@@ -28,7 +28,7 @@ from protocol.attack import Attack
 from protocol.messages import Inconsistent
 from protocol.motion import travelled
 from tests.browser import INKS, Open, inks, picture, scrub_to, stop_clock, until_shown, watching
-from tests.commands import BOUND_S
+from tests.commands import BOUND_S, copied
 
 STEP_MS = 250
 
@@ -60,8 +60,7 @@ def luminance(colour: str) -> float:
 
 @pytest.mark.long
 def test_a_first_range_is_a_circle_on_which_the_robot_may_be(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=0")
-    until_shown(page, 0)
+    page = opened(address, tick=0)
     first = inks(page)["ghost"]
     page.evaluate("location.hash = 'tick=3'")
     until_shown(page, 3)  # a has no range here, and b knows its path
@@ -114,8 +113,7 @@ def test_a_configuration_keeps_its_tint_though_its_place_changes(opened: Open, a
 
 @pytest.mark.long
 def test_the_predicted_distances_and_their_least_difference_are_listed(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=47")
-    until_shown(page, 47)
+    page = opened(address, tick=47)
     listed = page.locator("#predictions li")
     expect(listed).to_have_text(
         [
@@ -137,8 +135,7 @@ def test_the_predicted_distances_and_their_least_difference_are_listed(opened: O
 def test_the_measured_range_rules_configurations_out_one_by_one_the_worst_first(
     opened: Open, address: str
 ) -> None:
-    page = opened(f"{address}#tick=47")
-    until_shown(page, 47)
+    page = opened(address, tick=47)
     stop_clock(page)
     page.keyboard.press("Space")
     out: list[list[str]] = []
@@ -157,8 +154,7 @@ def test_the_measured_range_rules_configurations_out_one_by_one_the_worst_first(
 
 @pytest.mark.long
 def test_the_predicted_distances_are_circles_while_the_robot_drives(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=47")
-    until_shown(page, 47)
+    page = opened(address, tick=47)
     tints = [f"tint-{i}" for i in range(1, 5)]
     before = inks(page)
     stop_clock(page)
@@ -237,8 +233,7 @@ def test_an_honest_scene_has_no_reported_pose_on_the_wire(paper_1: Path, recordi
 
 
 def test_without_the_ground_truth_nothing_is_known_to_be_false(recording: Path, tmp_path: Path) -> None:
-    for path in recording.glob("agent-*.journal"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    copied(recording, tmp_path, "agent-a.journal", "agent-b.journal")
     journals = Recorded("", tmp_path)
     journals.load()
     assert journals.setup is not None

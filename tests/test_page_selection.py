@@ -42,8 +42,7 @@ def target(page: Page, kind: str, robot: str, place: int | None = None) -> tuple
 
 @pytest.mark.long
 def test_hovering_shows_the_numbers_and_a_click_selects_until_escape(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=47")
-    until_shown(page, 47)
+    page = opened(address, tick=47)
     page.keyboard.press("n")
     tip = page.locator("#tip")
     page.mouse.move(*target(page, "robot", "a"))
@@ -72,8 +71,7 @@ def test_hovering_shows_the_numbers_and_a_click_selects_until_escape(opened: Ope
 def test_the_address_holds_the_view_once_the_user_has_moved_the_camera_and_the_selection(
     opened: Open, address: str
 ) -> None:
-    page = opened(f"{address}#tick=20")
-    until_shown(page, 20)
+    page = opened(address, tick=20)
     page.mouse.click(*target(page, "anchor", "a"))
     expect(page).to_have_url(f"{address}#tick=20&select=anchor.a")
     page.keyboard.press("+")
@@ -137,8 +135,7 @@ TICK_PX = 34
 
 @pytest.mark.long
 def test_the_sequence_diagram_says_what_became_of_the_reports_of_the_tick(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=46")
-    until_shown(page, 46)
+    page = opened(address, tick=46)
     page.keyboard.press("d")
     diagram = page.locator("#sequence")
     expect(diagram).to_have_attribute(
@@ -158,8 +155,7 @@ def test_the_diagram_shows_a_killed_process_and_the_ticks_around_the_current_one
     killed = ("--kill", "a@20:command")
     assert tandem("run", "paper-1", "-q", "--out", tmp_path / "run", *killed).status == 0
     with watching(tmp_path / "run") as (_, address):
-        page = opened(f"{address}#tick=20")
-        until_shown(page, 20)
+        page = opened(address, tick=20)
         page.keyboard.press("d")
         diagram = page.locator("#sequence")
         gone = "Tick 20. a is down: its process is gone. a is back: its process replayed 21 ticks, identical."

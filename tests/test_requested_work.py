@@ -43,7 +43,7 @@ from protocol.documents import MOST_NESTED, Syntax, TooNested, check_nesting
 from protocol.network.endpoints import BadConfiguration, configured
 from tandem import clash
 from tests.browser import watching
-from tests.commands import ENDLESS, PAPER_1, Ended, processes_of, until
+from tests.commands import ENDLESS, PAPER_1, Ended, copied, processes_of, until
 from tests.commands import tandem as command
 from tests.series import series
 
@@ -282,8 +282,7 @@ OWN = {
 
 
 def test_a_recording_with_nested_files_is_read_without_them(paper_1: Path, tmp_path: Path) -> None:
-    for path in paper_1.glob("*.journal"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    copied(paper_1, tmp_path)
     for name in ("summary.json", "kills.jsonl"):
         (tmp_path / name).write_text(f"{NESTED}\n")
     note = f"{tmp_path / 'kills.jsonl'}: line 1: it is nested more than {MOST_NESTED} deep"

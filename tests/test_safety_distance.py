@@ -13,15 +13,7 @@ from msgspec.structs import replace
 
 from agent.planning import separation
 from agent.planning.agenda import Bypass
-from agent.planning.passing import (
-    BLOCKED_AFTER,
-    MOST_YIELDED,
-    RESERVE,
-    aside,
-    leeway,
-    limited,
-    passed,
-)
+from agent.planning.passing import BLOCKED_AFTER, MOST_YIELDED, RESERVE, aside, leeway, limited, passed
 from compose.audit.claim_rules import distance
 from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission

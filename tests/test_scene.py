@@ -30,6 +30,7 @@ from protocol.journal.journal_file import Journal
 from protocol.messages import MissionEnd
 from protocol.motion import REST, compose, wrap
 from protocol.wire import decode
+from tests.commands import copied
 from tests.series import series
 from tests.steps import NAMES
 from world.channel import LinkState
@@ -107,8 +108,7 @@ def test_local_poses_stand_where_the_robot_is_in_the_frame_that_the_stage_gives(
 def test_without_the_worlds_journal_the_scene_has_the_data_of_the_robots(
     paper_1: Path, tmp_path: Path
 ) -> None:
-    for path in paper_1.glob("agent-*.journal"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    copied(paper_1, tmp_path, "agent-a.journal", "agent-b.journal")
     shown, whole = performance(tmp_path), performance(paper_1)
     assert [robot_setup.id for robot_setup in shown.setup.robots] == ["a", "b"]
     assert all(player.pose is None for one in shown.scenes for player in one.players)
@@ -119,8 +119,7 @@ def test_without_the_worlds_journal_the_scene_has_the_data_of_the_robots(
 def test_without_a_robot_s_journal_what_it_sensed_follows_from_the_world_s(
     paper_1: Path, tmp_path: Path
 ) -> None:
-    for name in ("world.journal", "agent-b.journal"):
-        (tmp_path / name).write_bytes((paper_1 / name).read_bytes())
+    copied(paper_1, tmp_path, "world.journal", "agent-b.journal")
     shown, whole = performance(tmp_path), performance(paper_1)
     for one, other in zip(shown.scenes, whole.scenes, strict=True):
         assert one.player("a").anchor_range == other.player("a").anchor_range

@@ -28,7 +28,8 @@ from compose.view.scene import HeldPoses, Scene
 from protocol.messages import Localised, NamedRange, Observation
 from protocol.motion import ORIGIN, Controls
 from protocol.wire import decode
-from tests.browser import Open, shot, until_shown, watching
+from tests.browser import Open, shot, watching
+from tests.commands import copied
 from tests.commands import tandem as command
 from tests.missions import kept
 from tests.test_team import ALONE, DRAWN, MISSION, drawn, team
@@ -205,10 +206,7 @@ def test_a_team_is_run_again_from_other_starts(survey: Path) -> None:
 def test_tandem_figures_draws_a_team_and_says_in_one_line_what_is_not_of_teams(
     survey: Path, tmp_path: Path
 ) -> None:
-    copy = tmp_path / "recording"
-    copy.mkdir()
-    for path in survey.glob("*.journal"):
-        (copy / path.name).write_bytes(path.read_bytes())
+    copy = copied(survey, tmp_path / "recording")
     done = command("figures", str(copy), "--format", "svg")
     assert done.status == 0, done.err
     assert {path.name for path in (copy / "figures").iterdir()} == {"trajectory.svg", "errors.svg"}
@@ -235,8 +233,7 @@ def test_the_page_names_anchors_and_shows_unknown_ones_with_the_truth_only(
     opened: Open, survey: Path
 ) -> None:
     with watching(survey) as (_, where):
-        page = opened(f"{where}#tick=0")
-        until_shown(page, 0)
+        page = opened(where, tick=0)
         shot(page, "team")
         assert page.evaluate(ANCHORS) == ["A1", "A2", "A3", "A4"]
         assert {"A1", "A3"} <= {*page.evaluate(LABELS)}

@@ -33,15 +33,7 @@ from compose.scenario.scenario_file import load, parse, scenario_table, validate
 from compose.sweep.hunt.invariants import truth_lost
 from protocol.coverage_strips import SweptArea
 from protocol.journal.journal_file import CorruptJournal
-from protocol.messages import (
-    Command,
-    Contact,
-    Localised,
-    Observation,
-    Report,
-    ReportedPose,
-    TickStart,
-)
+from protocol.messages import Command, Contact, Localised, Observation, Report, ReportedPose, TickStart
 from protocol.motion import ORIGIN, REST, Controls, Pose, step
 from protocol.wire import decode, encode
 from tests.browser import Open, scrub_to, shot, watching

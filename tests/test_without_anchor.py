@@ -26,15 +26,7 @@ from compose.scenario.scenario_file import load
 from protocol.coverage_strips import SIDE, STRIP_REACH, SweptArea
 from protocol.coverage_ticks import way_ticks
 from protocol.messages import Contact as Detection
-from protocol.messages import (
-    Estimate,
-    Localised,
-    Observation,
-    Report,
-    ReportedPose,
-    RobotConfig,
-    Undecided,
-)
+from protocol.messages import Estimate, Localised, Observation, Report, ReportedPose, RobotConfig, Undecided
 from protocol.mission import Mission
 from protocol.motion import ORIGIN, REST, Controls, Covariance, Pose, Segment, compose, step
 from protocol.noise import Noise
