@@ -85,7 +85,7 @@ def firefox() -> Iterator[Browser]:
 
 @contextmanager
 def pages(browser: Browser) -> Iterator[Open]:
-    """Yield a function that opens pages.
+    """Yield a function that opens pages, and waits until a page shows the `tick`, if there is one.
 
     At the end, fail if a page has logged an error, or has sent a request to any other host than the server.
     """
@@ -93,7 +93,9 @@ def pages(browser: Browser) -> Iterator[Open]:
     hosts: set[str] = set()
     opened: list[Page] = []
 
-    def opens(address: str, *, width: int = 1280, height: int = 800, dark: bool = False) -> Page:
+    def opens(
+        address: str, *, tick: int | None = None, width: int = 1280, height: int = 800, dark: bool = False
+    ) -> Page:
         page = browser.new_page(
             viewport={"width": width, "height": height}, color_scheme="dark" if dark else "light"
         )
@@ -104,7 +106,9 @@ def pages(browser: Browser) -> Iterator[Open]:
         page.set_default_timeout(BOUND_MS)
         if browser.browser_type.name == "firefox":
             page.route(DOCUMENT, without_policy)
-        page.goto(address)
+        page.goto(address if tick is None else f"{address}#tick={tick}")
+        if tick is not None:
+            until_shown(page, tick)
         return page
 
     yield opens

@@ -325,6 +325,26 @@ def size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
 
 
+def copied(recording: Path, folder: Path, *names: str) -> Path:
+    """Copy the journals of a recording, or those of these names, and return the folder, which may be new."""
+    folder.mkdir(exist_ok=True)
+    for path in [recording / name for name in names] or recording.glob("*.journal"):
+        (folder / path.name).write_bytes(path.read_bytes())
+    return folder
+
+
+def in_one_process(scenario: str | Path, out: Path) -> Path:
+    """Run a mission in one process, and return `out`, which is then its recording."""
+    ended = tandem("run", scenario, "--in-process", "-q", "--out", out)
+    assert ended.status == 0, ended
+    return out
+
+
+def decided(folder: Path) -> dict[str, bytes]:
+    """Return all files of a recording that are the same however the mission is run, by name."""
+    return journals(folder) | {"ticks.csv": (folder / "ticks.csv").read_bytes()}
+
+
 def journals(folder: Path) -> dict[str, bytes]:
     """Return the content of every journal in `folder`, by name."""
     return {path.name: path.read_bytes() for path in sorted(folder.glob("*.journal"))}

@@ -17,7 +17,7 @@ from compose.recording.ranging.range_files import read_ranges
 from compose.recording.ranging.range_recording import RangeRecording
 from compose.scenario.scenario_file import load
 from tests.browser import Open, launched, pages, watching
-from tests.commands import ENDLESS, tandem
+from tests.commands import ENDLESS, in_one_process, tandem
 from tests.range_tables import SAMPLE
 
 settings.register_profile("tandem", derandomize=True, deadline=None, database=None, max_examples=60)
@@ -114,6 +114,12 @@ def endless(tmp_path: Path) -> Path:
 def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the recording of paper-1, which tests must not change."""
     return recorded("paper-1", tmp_path_factory.mktemp("recorded"))
+
+
+@pytest.fixture(scope="session")
+def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Return the recording of paper-1 by the command in one process, with contact from tick 46 to 48."""
+    return in_one_process("paper-1", tmp_path_factory.mktemp("undisturbed") / "out")
 
 
 @pytest.fixture(scope="session")

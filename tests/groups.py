@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Mapping
+from copy import deepcopy
 from typing import Any
 
 from compose.recording.run import Run
@@ -55,6 +56,19 @@ def random_table(seed: int, mission: Mapping[str, Any] = {}, **group: Any) -> di
 def random_group(seed: int, **group: Any) -> Scenario:
     """Return the scenario of `random_table`, with the fields `group`."""
     return validate(random_table(seed, **group), "group.toml").seeded(None)
+
+
+def with_value(table: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """Return `table` with a value at a path such as `robot.0.attack`, or without it if that is None."""
+    changed = deepcopy(table)
+    *names, last = [int(name) if name.isdigit() else name for name in path.split(".")]
+    place: Any = changed
+    for name in names:
+        place = place[name]
+    place[last] = value
+    if value is None:
+        del place[last]
+    return changed
 
 
 def localised(run: Run) -> set[str]:

@@ -1,8 +1,8 @@
 """Mutated range recordings of 10 s in all formats: `python -m tests.mutated_recordings 10000`.
 
-This is a measurement, because it takes long; `tests/test_cases.py` runs 60. Each trial changes a small
-recording at a few places, and estimates or calibrates it in a process of its own. It must end with the exit
-status 0, 1 or 2, without a traceback, with at most one line of error, and within BOUND_CPU_S and BOUND_MB.
+This is a measurement, because it takes long; `tests/test_bad_recordings.py` runs 60. Each trial changes a
+small recording at a few places, and estimates or calibrates it in a process of its own. It must end with the
+exit status 0, 1 or 2, without a traceback, with one line of error at most, within BOUND_CPU_S and BOUND_MB.
 
 `--keep DIR --only 17` writes the recording of trial 17 to DIR, and shows what the command prints.
 """

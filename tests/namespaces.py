@@ -28,7 +28,7 @@ from protocol.messages import Command, DeadlineMissed, Environment, FinalReport,
 from protocol.network import session
 from protocol.network.endpoints import Endpoints, configured
 from protocol.wire import MAX_FRAME_BYTES, decode
-from tests.commands import LONGER, PAPER_1, Ended, TandemProcess, journals, size, tandem, until
+from tests.commands import LONGER, PAPER_1, Ended, TandemProcess, decided, in_one_process, size, tandem, until
 from world.scenario import Scenario
 
 HOSTS = {"world": "10.77.0.1", "a": "10.77.0.2", "b": "10.77.0.3", "router": "10.77.0.4"}
@@ -221,7 +221,7 @@ def play(case: Case, network: Network, expected: dict[str, bytes]) -> tuple[dict
             until(lambda: not run.running or run.answered() > before, "both answer again")
         resumed = time.monotonic() - well
         ended = {name: part.ended() for name, part in run.parts.items()}
-        found = journals(run.out) | {"ticks.csv": (run.out / "ticks.csv").read_bytes()}
+        found = decided(run.out)
     if case.real_time:
         return ended, resumed, "-"
     return ended, resumed, "yes" if found == expected else "NO"
@@ -230,10 +230,9 @@ def play(case: Case, network: Network, expected: dict[str, bytes]) -> tuple[dict
 def local() -> dict[str, bytes]:
     """Return the recording of the lockstep mission, run in one process."""
     with tempfile.TemporaryDirectory(prefix="tandem-hosts-") as folder:
-        scenario, out = Path(folder) / "scenario.toml", Path(folder) / "out"
+        scenario = Path(folder) / "scenario.toml"
         scenario.write_text(LONGER)
-        assert tandem("run", scenario, "--in-process", "-q", "--out", out).status == 0
-        return journals(out) | {"ticks.csv": (out / "ticks.csv").read_bytes()}
+        return decided(in_one_process(scenario, Path(folder) / "out"))
 
 
 def route(listen: str, connect: list[str], keys: Path | None) -> None:

@@ -8,8 +8,11 @@ import random
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
+import pytest
 from mcap.writer import Writer
 
+from compose.errors import USER_ERROR, UserError
+from compose.recording.ranging.range_files import read_ranges
 from protocol.motion import Controls, Pose, step
 
 SAMPLE = Path(__file__).parent / "data" / "uwb" / "tiers-a-b-30-s.pyfg"
@@ -78,3 +81,15 @@ def circling(duration_s: float) -> dict[str, list[dict[str, object]]]:
             rho = round(math.dist((pose.x, pose.y), place) + draw.gauss(0.0, 0.05), 4)
             tables["ranges"].append({"t": ends["t1"], "from": "r", "to": name, "range": rho, "sigma": 0.05})
     return tables
+
+
+POSE: dict[str, object] = {"robot": "a", "t": 0, "x": 1, "y": 2, "heading": 3}
+
+
+def refused(path: Path) -> str:
+    """Return the one line with which `path` is refused."""
+    with pytest.raises(UserError) as error:
+        read_ranges(path)
+    assert error.value.exit_status == USER_ERROR
+    assert "\n" not in str(error.value)
+    return str(error.value)

@@ -1,26 +1,23 @@
-"""A simulated robot base as zenoh-bridge-ros2dds exposes it: Twists in, Odometry and Ranges out, in CDR.
+"""A simulated robot base as zenoh-bridge-ros2dds exposes it: Twists in, Odometry and Ranges out, in CDR."""
 
-It shares no code with the driver: the messages are declared here with pycdr2, from the definitions of ROS 2
-Humble (common_interfaces). pycdr2 evaluates annotations at run time, so they must not be strings.
-"""
+from __future__ import annotations
 
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
 import zenoh
-from pycdr2 import IdlStruct
-from pycdr2.types import array, float32, float64, int32, sequence, uint8, uint32
+from rosbags.typesys import Stores, get_typestore
 
 from protocol.motion import Pose, step
 from protocol.network import session
 from protocol.network.endpoints import listening
 
-Covariance: Any = array[float64, 36]  # type: ignore[misc]
+STORE = get_typestore(Stores.ROS2_HUMBLE)
 PERIOD_S = 0.01
 """The period in s of odometry and ranges."""
 WATCHDOG_S = 0.5
@@ -30,146 +27,50 @@ A driver on a busy machine may be late by tens of milliseconds, which must not s
 """
 
 
-@dataclass
-class Time(IdlStruct, typename="builtin_interfaces/msg/Time"):
-    sec: int32 = 7
-    nanosec: uint32 = 8
+def message(kind: str, *fields: Any) -> Any:
+    """Return a message of a type such as `geometry_msgs/Point`."""
+    return STORE.types[kind.replace("/", "/msg/")](*fields)
 
 
-@dataclass
-class Header(IdlStruct, typename="std_msgs/msg/Header"):
-    stamp: Time = field(default_factory=Time)
-    frame_id: str = "odom"
+def oriented(turned: Sequence[float], at: Sequence[float] = (0.0, 0.0, 0.0), frame: str = "odom") -> Any:
+    """Return an Odometry with this quaternion."""
+    still = message("geometry_msgs/Vector3", 0.0, 0.0, 0.0)
+    pose = message(
+        "geometry_msgs/Pose",
+        message("geometry_msgs/Point", *at),
+        message("geometry_msgs/Quaternion", *turned),
+    )
+    twist = message("geometry_msgs/Twist", still, still)
+    return message(
+        "nav_msgs/Odometry",
+        header(frame),
+        "base_link",
+        message("geometry_msgs/PoseWithCovariance", pose, np.zeros(36)),
+        message("geometry_msgs/TwistWithCovariance", twist, np.zeros(36)),
+    )
 
 
-@dataclass
-class Vector3(IdlStruct, typename="geometry_msgs/msg/Vector3"):
-    x: float64 = 0.0
-    y: float64 = 0.0
-    z: float64 = 0.0
+def header(frame: str) -> Any:
+    return message("std_msgs/Header", message("builtin_interfaces/Time", 7, 8), frame)
 
 
-@dataclass
-class Quaternion(IdlStruct, typename="geometry_msgs/msg/Quaternion"):
-    x: float64
-    y: float64
-    z: float64
-    w: float64
-
-
-@dataclass
-class Twist(IdlStruct, typename="geometry_msgs/msg/Twist"):
-    linear: Vector3 = field(default_factory=Vector3)
-    angular: Vector3 = field(default_factory=Vector3)
-
-
-@dataclass
-class TwistStamped(IdlStruct, typename="geometry_msgs/msg/TwistStamped"):
-    header: Header
-    twist: Twist
-
-
-@dataclass
-class RosPose(IdlStruct, typename="geometry_msgs/msg/Pose"):
-    position: Vector3
-    orientation: Quaternion
-
-
-@dataclass
-class PoseWithCovariance(IdlStruct, typename="geometry_msgs/msg/PoseWithCovariance"):
-    pose: RosPose
-    covariance: Covariance
-
-
-@dataclass
-class TwistWithCovariance(IdlStruct, typename="geometry_msgs/msg/TwistWithCovariance"):
-    twist: Twist
-    covariance: Covariance
-
-
-@dataclass
-class Odometry(IdlStruct, typename="nav_msgs/msg/Odometry"):
-    header: Header
-    child_frame_id: str
-    pose: PoseWithCovariance
-    twist: TwistWithCovariance
-
-
-@dataclass
-class Range(IdlStruct, typename="sensor_msgs/msg/Range"):
-    header: Header
-    radiation_type: uint8
-    field_of_view: float32
-    min_range: float32
-    max_range: float32
-    range: float32
-
-
-@dataclass
-class PoseWithCovarianceStamped(IdlStruct, typename="geometry_msgs/msg/PoseWithCovarianceStamped"):
-    header: Header
-    pose: PoseWithCovariance
-
-
-@dataclass
-class Transform(IdlStruct, typename="geometry_msgs/msg/Transform"):
-    translation: Vector3
-    rotation: Quaternion
-
-
-@dataclass
-class TransformStamped(IdlStruct, typename="geometry_msgs/msg/TransformStamped"):
-    header: Header
-    child_frame_id: str
-    transform: Transform
-
-
-@dataclass
-class TFMessage(IdlStruct, typename="tf2_msgs/msg/TFMessage"):
-    transforms: sequence[TransformStamped]  # type: ignore[type-arg]
-
-
-@dataclass
-class KeyValue(IdlStruct, typename="diagnostic_msgs/msg/KeyValue"):
-    key: str
-    value: str
-
-
-@dataclass
-class DiagnosticStatus(IdlStruct, typename="diagnostic_msgs/msg/DiagnosticStatus"):
-    level: uint8
-    name: str
-    message: str
-    hardware_id: str
-    values: sequence[KeyValue]  # type: ignore[type-arg]
-
-
-@dataclass
-class DiagnosticArray(IdlStruct, typename="diagnostic_msgs/msg/DiagnosticArray"):
-    header: Header
-    status: sequence[DiagnosticStatus]  # type: ignore[type-arg]
+def cdr(content: Any) -> bytes:
+    return bytes(STORE.serialize_cdr(content, content.__msgtype__))
 
 
 def odometry(pose: Pose, norm: float = 1.0, frame: str = "odom") -> bytes:
     half = 0.5 * pose.heading
-    turned = Quaternion(0.0, 0.0, norm * math.sin(half), norm * math.cos(half))
-    return oriented(turned, Vector3(pose.x, pose.y, 0.0), frame)
-
-
-def oriented(turned: Quaternion, at: Vector3 | None = None, frame: str = "odom") -> bytes:
-    zeros = [0.0] * 36
-    pose = PoseWithCovariance(RosPose(at or Vector3(), turned), zeros)
-    message = Odometry(Header(frame_id=frame), "base_link", pose, TwistWithCovariance(Twist(), zeros))
-    return bytes(message.serialize())
+    turned = (0.0, 0.0, norm * math.sin(half), norm * math.cos(half))
+    return cdr(oriented(turned, (pose.x, pose.y, 0.0), frame))
 
 
 def ranged(rho: float, most: float = 100.0, least: float = 0.1) -> bytes:
-    return bytes(Range(Header(frame_id="uwb"), 0, 0.1, least, most, rho).serialize())
+    return cdr(message("sensor_msgs/Range", header("uwb"), 0, 0.1, least, most, rho))
 
 
 def twist(payload: bytes) -> tuple[float, float]:
-    message: Any = Twist.deserialize(payload)
-    return message.linear.x, message.angular.z
+    found: Any = STORE.deserialize_cdr(payload, "geometry_msgs/msg/Twist")
+    return found.linear.x, found.angular.z
 
 
 class Base:

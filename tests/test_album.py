@@ -51,7 +51,7 @@ from protocol.messages import Command
 from protocol.mission import ROLES, Role
 from protocol.motion import step, wrap
 from protocol.wire import MalformedFrame, decode, encode
-from tests.commands import PAPER_1, SECTION_IV, on_a_terminal, several_pairs, tandem
+from tests.commands import PAPER_1, SECTION_IV, copied, on_a_terminal, several_pairs, tandem
 from tests.reference import REFERENCE
 from tests.series import series
 from world.scenario import Scenario
@@ -137,12 +137,6 @@ def cut(journal: Path, count: int) -> None:
     """Truncate the journal to its first `count` frames and a torn one."""
     left = list(frames(journal))[:count]
     journal.write_bytes(b"".join([msgpack.packb(frame) for frame in left]) + b"\xc4\x10torn")
-
-
-def copied(folder: Path, there: Path) -> Path:
-    for journal in folder.glob("*.journal"):
-        (there / journal.name).write_bytes(journal.read_bytes())
-    return there
 
 
 # --- contents -------------------------------------------------------------------------------------------

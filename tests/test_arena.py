@@ -96,7 +96,8 @@ def test_a_mistake_is_one_line(words: tuple[str, ...], says: str, tmp_path: Path
 def test_the_error_of_a_planner_is_told_below_the_table(tmp_path: Path) -> None:
     lines = ("from tandem.planning import Assured", "class Own(Assured):", "    def observe(self, *_): 1 / 0")
     (tmp_path / "mine.py").write_text("\n".join(lines))
-    ended = command("arena", "mine:Own", "--trials", "1", "--workers", "1", cwd=tmp_path)
+    words = ("--scenario", "noisy", "--trials", "1", "--workers", "1")
+    ended = command("arena", "mine:Own", *words, cwd=tmp_path)
     why = "observe() at tick 0 raises ZeroDivisionError: division by zero (mine.py:3)"
     assert "noisy, mine:Own: trial 0, failed: " in " ".join(ended.out.split())
     assert why in " ".join(ended.out.split())

@@ -20,6 +20,7 @@ LISTEN = ("--listen", "tcp/127.0.0.1:7447")
 CONNECT = ("--connect", "tcp/127.0.0.1:7447")
 GOOD = PAPER_1.replace("seed = 1", "seed = 1\nmax_ticks = 500")
 FOUR = several_pairs(2)
+QUANTITIES = {"sensing_range": 3.0, "period": 1.0, "max_speed": 1.0, "max_turn_rate": 3.141592653589793}
 SWEEP = 'name = "mine"\nscenario = "paper-1"\ntrials = 1\n'
 
 
@@ -34,6 +35,14 @@ def refused_scenario(text: str | bytes, folder: Path, field: str) -> None:
 def changed(text: str, was: str, new: str) -> str:
     assert was in text
     return text.replace(was, new, 1)
+
+
+def refused_text(text: str, field: str) -> None:
+    """Assert the same as `refused_scenario`, without a process."""
+    with pytest.raises(BadScenario) as bad:
+        parse(text, "mine.toml")
+    assert str(bad.value).startswith(f"mine.toml: {field}")
+    assert "\n" not in str(bad.value)
 
 
 # --- scenario files ---------------------------------------------------------------------------------
@@ -72,71 +81,54 @@ def test_an_unknown_field_is_named(was: str, typo: str, field: str, tmp_path: Pa
 
 
 ATTACK = 'id = "a"\nattack = {{kind = "{}", size = 2, part = "{}"}}'
-UNKNOWN_WORDS = {
+VALUES: list[tuple[str, str, str]] = [
     (
         '"paper"',
         '"papers"',
-    ): "planner.name: there is no 'papers'; there are assured, paper, fisher, greedy, ra",
-    ('id = "a"', ATTACK.format("scal", "all")): "robot[0].attack.kind: there is no 'scal'; ",
-    ('id = "a"', ATTACK.format("radius", "orbit")): "robot[0].attack.part: an attack of kind radius changes",
-    ('id = "a"', ATTACK.format("scale", "orbits")): (
-        "robot[0].attack.part: there is no 'orbits'; there are all, encounter, orbit, phase-1; did"
+        "planner.name: there is no 'papers'; there are assured, paper, fisher, greedy, ra",
     ),
-    ("[planner]", '[[kill]]\npoint = "sens"\n[planner]'): (
-        "kill[0].point: there is no 'sens'; there are ?, command, journal, observation, report"
+    ('id = "a"', ATTACK.format("scal", "all"), "robot[0].attack.kind: there is no 'scal'; "),
+    ('id = "a"', ATTACK.format("radius", "orbit"), "robot[0].attack.part: an attack of kind radius changes"),
+    (
+        'id = "a"',
+        ATTACK.format("scale", "orbits"),
+        "robot[0].attack.part: there is no 'orbits'; there are all, encounter, orbit, phase-1; did",
     ),
-}
+    (
+        "[planner]",
+        '[[kill]]\npoint = "sens"\n[planner]',
+        "kill[0].point: there is no 'sens'; there are ?, command, journal, observation, report",
+    ),
+    ('name = "paper-1"\n', "", "missing field 'name'"),
+    *((f"{name} = {value}\n", "", f"mission: missing field '{name}'") for name, value in QUANTITIES.items()),
+    ('id = "b"\n', "", "robot[1]: missing field 'id'"),
+    ("anchor = [0.0, 0.0]\n", "", "robot[0]: missing field 'anchor'"),
+    *(
+        (f"{name} = {value}", f"{name} = {wrong}", f"mission.{name}: ")
+        for name, value in QUANTITIES.items()
+        for wrong in ("nan", "inf", "-1.0", "0", "1e300", "5e-324", '"1"')
+    ),
+    *(("seed = 1", f"seed = {v}", "seed: ") for v in ("-1", "1.5", '"1"', "true", "nan", str(2**63))),
+    *(("= 500", f"= {v}", "max_ticks: ") for v in ("0", "-1", "1.5", '"1"', "inf", str(10**30))),
+    *((GOOD.split('"')[1], v, "name: ") for v in ("", "a b", "a/b", "*", "é", "x" * 65, "x\\n")),
+    *(('id = "a"', f'id = "{v}"', "robot[0].id: ") for v in ("", "a b", "a/b", "*", "x" * 33, "a\\n")),
+    *(('id = "a"', f"id = {v}", "robot[0].id: ") for v in ("1", "[]")),
+    *(('"paper"', v, "planner.name: ") for v in ('"Paper"', '""', "1", '"two\\nlines"')),
+    ("[0.0, 0.0]", "[0.0]", "robot[0].anchor: "),
+    ("[0.0, 0.0]", "[0.0, nan]", "robot[0].anchor[1]: "),
+    ("[0.0, 0.0]", "[1e300, 0.0]", "robot[0].anchor[0]: "),
+    ("[0.0, 0.0]", '"origin"', "robot[0].anchor: "),
+    ("[2.4, -1.2, 4.8]", "[2.4, -1.2]", "robot[0].start: "),
+    ("[2.4, -1.2, 4.8]", "[2.4, -1.2, nan]", "robot[0].start[2]: "),
+    ("[2.4, -1.2, 4.8]", "[-inf, -1.2, 4.8]", "robot[0].start[0]: "),
+    ("[2.4, -1.2, 4.8]", '["x", -1.2, 4.8]', "robot[0].start[0]: "),
+    ("[2.4, -1.2, 4.8]", "2.4", "robot[0].start: "),
+]
+"""Changes of GOOD that are refused: unknown words, missing fields, and values out of bounds."""
 
 
-@pytest.mark.parametrize(("was", "new"), UNKNOWN_WORDS)
-def test_an_unknown_word_is_refused_with_the_known_ones(was: str, new: str) -> None:
-    refused_text(changed(GOOD, was, new), UNKNOWN_WORDS[was, new])
-
-
-@pytest.mark.parametrize(
-    ("line", "field"),
-    [
-        ('name = "paper-1"\n', "missing field 'name'"),
-        ("period = 1.0\n", "mission: missing field 'period'"),
-        ("sensing_range = 3.0\n", "mission: missing field 'sensing_range'"),
-        ("max_speed = 1.0\n", "mission: missing field 'max_speed'"),
-        ("max_turn_rate = 3.141592653589793\n", "mission: missing field 'max_turn_rate'"),
-        ('id = "b"\n', "robot[1]: missing field 'id'"),
-        ("anchor = [0.0, 0.0]\n", "robot[0]: missing field 'anchor'"),
-    ],
-)
-def test_a_missing_field_is_named(line: str, field: str) -> None:
-    refused_text(changed(GOOD, line, ""), field)
-
-
-@pytest.mark.parametrize("value", ["nan", "inf", "-1.0", "0", "1e300", "5e-324", '"1"'])
-@pytest.mark.parametrize("line", re.findall(r"^(?:sensing|period|max_speed|max_turn).*", GOOD, re.MULTILINE))
-def test_what_must_be_a_positive_quantity_is(line: str, value: str) -> None:
-    field = line.partition(" = ")[0]
-    refused_text(changed(GOOD, line, f"{field} = {value}"), f"mission.{field}: ")
-
-
-@pytest.mark.parametrize(
-    ("was", "new", "field"),
-    [
-        *(("seed = 1", f"seed = {v}", "seed: ") for v in ("-1", "1.5", '"1"', "true", "nan", str(2**63))),
-        *(("= 500", f"= {v}", "max_ticks: ") for v in ("0", "-1", "1.5", '"1"', "inf", str(10**30))),
-        *((GOOD.split('"')[1], v, "name: ") for v in ("", "a b", "a/b", "*", "é", "x" * 65, "x\\n")),
-        *(('id = "a"', f'id = "{v}"', "robot[0].id: ") for v in ("", "a b", "a/b", "*", "x" * 33, "a\\n")),
-        *(('id = "a"', f"id = {v}", "robot[0].id: ") for v in ("1", "[]")),
-        *(('"paper"', v, "planner.name: ") for v in ('"Paper"', '""', "1", '"two\\nlines"')),
-        ("[0.0, 0.0]", "[0.0]", "robot[0].anchor: "),
-        ("[0.0, 0.0]", "[0.0, nan]", "robot[0].anchor[1]: "),
-        ("[0.0, 0.0]", "[1e300, 0.0]", "robot[0].anchor[0]: "),
-        ("[0.0, 0.0]", '"origin"', "robot[0].anchor: "),
-        ("[2.4, -1.2, 4.8]", "[2.4, -1.2]", "robot[0].start: "),
-        ("[2.4, -1.2, 4.8]", "[2.4, -1.2, nan]", "robot[0].start[2]: "),
-        ("[2.4, -1.2, 4.8]", "[-inf, -1.2, 4.8]", "robot[0].start[0]: "),
-        ("[2.4, -1.2, 4.8]", '["x", -1.2, 4.8]', "robot[0].start[0]: "),
-        ("[2.4, -1.2, 4.8]", "2.4", "robot[0].start: "),
-    ],
-)
-def test_a_value_out_of_bounds_is_named(was: str, new: str, field: str) -> None:
+@pytest.mark.parametrize(("was", "new", "field"), VALUES)
+def test_a_missing_field_and_a_value_out_of_bounds_are_named(was: str, new: str, field: str) -> None:
     refused_text(changed(GOOD, was, new), field)
 
 
@@ -159,6 +151,18 @@ def test_a_mission_in_which_no_robot_could_claim_is_refused(
     refused(tandem("run", "mine.toml", cwd=tmp_path), why)
 
 
+def test_a_mission_in_which_a_turn_takes_a_month_is_checked_at_once() -> None:
+    """The largest error of phase 1 is sought among the ticks of half a turn: here, three million."""
+    begin = time.process_time()
+    assert infeasibility(Mission(3.0, 1.0, 1.0, 1e-6), 10.0) is None
+    assert time.process_time() - begin < 0.5
+
+
+def with_noise(field: str, value: str) -> str:
+    """Return GOOD with that field in its mission table; dotted TOML keys are nested tables."""
+    return changed(GOOD, "[mission]\n", f"[mission]\n{field} = {value}\n")
+
+
 AMOUNTS = {
     "accuracy": ("0.0", "5e-324", "-0.1", "2e6", "nan", "inf", '"0.1"', "true", "[0.1]"),
     "confidence": ("0.4", "1.0", "1", "-0.5", "nan", '"sure"', "false"),
@@ -175,57 +179,6 @@ AMOUNTS = {
     "noise": ("0.01", "[]", "true"),
 }
 """Invalid values for the fields of `noise`."""
-
-
-def test_a_mission_in_which_a_turn_takes_a_month_is_checked_at_once() -> None:
-    """The largest error of phase 1 is sought among the ticks of half a turn: here, three million."""
-    begin = time.process_time()
-    assert infeasibility(Mission(3.0, 1.0, 1.0, 1e-6), 10.0) is None
-    assert time.process_time() - begin < 0.5
-
-
-def with_noise(field: str, value: str) -> str:
-    """Return GOOD with that field in its mission table; dotted TOML keys are nested tables."""
-    return changed(GOOD, "[mission]\n", f"[mission]\n{field} = {value}\n")
-
-
-def refused_text(text: str, field: str) -> None:
-    """Assert the same as `refused_scenario`, without a process."""
-    with pytest.raises(BadScenario) as bad:
-        parse(text, "mine.toml")
-    assert str(bad.value).startswith(f"mine.toml: {field}")
-    assert "\n" not in str(bad.value)
-
-
-@pytest.mark.parametrize(
-    ("field", "value"), [(field, value) for field, values in AMOUNTS.items() for value in values]
-)
-def test_noise_out_of_bounds_is_named(field: str, value: str) -> None:
-    refused_text(with_noise(field, value), f"mission.{field}: ")
-
-
-def test_a_profile_that_does_not_exist_is_named_with_those_that_do() -> None:
-    refused_text(
-        with_noise("noise", '"little"'),
-        "mission.noise.profile: there is no 'little'; there are camera, uwb, ",
-    )
-
-
-@pytest.mark.parametrize(
-    ("field", "says"),
-    [
-        ("acuracy", "mission: unknown field 'acuracy'"),
-        ("confidense", "mission: unknown field 'confidense'"),
-        ("noise.sigma", "mission.noise: unknown field 'sigma'"),
-        ("noise.outlier", "mission.noise: unknown field 'outlier'"),
-        ("noise.odometry.w", "mission.noise.odometry: unknown field 'w'"),
-        ("noise.actuation.vfloor", "mission.noise.actuation: unknown field 'vfloor'"),
-    ],
-)
-def test_noise_misspelt_is_named(field: str, says: str) -> None:
-    refused_text(with_noise(field, "0.1"), says)
-
-
 TOO_MANY_RANGES = "0.001 m takes the mean of more than 10000 ranges"
 USELESS_NOISE = {
     "noise.outlier_bias = [2.0, 0.3]": "noise.outlier_bias: the lower bound 2 m is above the upper bound 0.3",
@@ -243,11 +196,29 @@ USELESS_NOISE = {
     "noise.actuation.v_floor = 1.1": "noise.actuation.v_floor: more than mission.max_speed = 1 m/s",
     "noise.odometry.omega_floor = 4.0": "noise.odometry.omega_floor: more than mission.max_turn_rate = 3.14",
 }
+MISSPELT = {
+    "acuracy": "mission: unknown field 'acuracy'",
+    "confidense": "mission: unknown field 'confidense'",
+    "noise.sigma": "mission.noise: unknown field 'sigma'",
+    "noise.outlier": "mission.noise: unknown field 'outlier'",
+    "noise.odometry.w": "mission.noise.odometry: unknown field 'w'",
+    "noise.actuation.vfloor": "mission.noise.actuation: unknown field 'vfloor'",
+}
 
 
-@pytest.mark.parametrize("told", USELESS_NOISE)
-def test_noise_with_which_no_robot_could_claim_is_refused(told: str) -> None:
-    refused_text(with_noise(*told.split(" = ", 1)), f"mission.{USELESS_NOISE[told]}")
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        *((field, value, f"mission.{field}: ") for field, values in AMOUNTS.items() for value in values),
+        *((field, "0.1", says) for field, says in MISSPELT.items()),
+        *((*told.split(" = ", 1), f"mission.{says}") for told, says in USELESS_NOISE.items()),
+        ("noise", '"little"', "mission.noise.profile: there is no 'little'; there are camera, uwb, "),
+    ],
+)
+def test_noise_that_is_misspelt_out_of_bounds_or_too_large_for_a_claim_is_named(
+    field: str, value: str, says: str
+) -> None:
+    refused_text(with_noise(field, value), says)
 
 
 def test_a_mission_with_noise_at_its_bounds_runs() -> None:

@@ -7,11 +7,8 @@ import time
 from collections.abc import Callable, Iterable
 from itertools import pairwise
 from pathlib import Path
-from typing import cast
 
 import pytest
-import zenoh
-from msgspec.structs import replace
 
 from compose.launch.driver_loader import config_of
 from compose.recording.reasons import reason_for
@@ -26,6 +23,7 @@ from protocol.messages import (
     Localised,
     MissionEnd,
     Observation,
+    RobotConfig,
     TickStart,
     Undecided,
     Verdict,
@@ -35,7 +33,7 @@ from protocol.network import keys
 from protocol.network.session import SILENCE_S
 from protocol.wire import decode, encode
 from tests.commands import ASSURED, PAPER_1
-from tests.stage import Stage
+from tests.stage import FINAL_REPORT, LINK, MANOEUVRE_S, TICK_S, Member, Recorded, Stage, begins, command
 from world.hardware import bridge
 from world.hardware.bridge import ASTRAY, Field, NoStart
 from world.hardware.driver import THINKING, Reading
@@ -45,52 +43,18 @@ from world.hardware.tick_source import UNHEARD
 
 Answer = Callable[[int], Iterable[bytes]]
 """The frames that are sent in answer to the Observation of a tick."""
-LINK = cast(zenoh.Session, None)
-"""A placeholder; a stage needs no session."""
-MANOEUVRE_S = 0.1
 SCENARIO = parse(PAPER_1, "paper-1")
 CONFIG = config_of(SCENARIO, "a", MANOEUVRE_S)
+
+
+def assured(robot: str) -> RobotConfig:
+    """Return the configuration of a robot that tolerates any number of missed deadlines."""
+    return config_of(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
 
 
 @pytest.fixture
 def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
     return Stage(monkeypatch)
-
-
-class Recorded:
-    """A driver that only records its commands and their times."""
-
-    def __init__(self, fails_at: int | None = None, reading: Reading | None = None) -> None:
-        self.commands: list[tuple[float, float]] = []
-        self.ticks: list[tuple[int, float]] = []
-        self.stopped = 0
-        self.clock = time.monotonic
-        self._fails_at = fails_at
-        self._reading = reading or Reading(REST, 2.0)
-
-    def sense(self, tick: int) -> Reading:
-        self.ticks.append((tick, self.clock()))
-        if tick == self._fails_at:
-            raise OSError("no such device")
-        return self._reading
-
-    def drive(self, v: float, omega: float) -> None:
-        self.commands.append((v, omega))
-
-    def stop(self) -> None:
-        self.stopped += 1
-
-    def close(self) -> None:
-        pass
-
-
-FINAL_REPORT = FinalReport(
-    "a", 0, 0, None, None, None, None, None, None, None, None, None, 0, 0, 0, 0, 0, 0, 0
-)
-
-
-def command(tick: int, robot: str = "a", v: float = 0.5, verdict: Verdict | None = None) -> Command:
-    return Command(tick, robot, v, 0.25, 1, "straight", verdict)
 
 
 Play = Callable[..., tuple[Field, MissionEnd, list[MissionEnd]]]
@@ -139,7 +103,7 @@ def test_a_command_in_time_is_executed_and_a_tick_lasts_a_manoeuvre_and_a_decisi
     assert told == [end]
     assert driver.stopped >= 1
     took = driver.ticks[-1][1] - driver.ticks[0][1]
-    assert took == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
+    assert took == pytest.approx(5 * TICK_S)
 
 
 NONSENSE: dict[str, Answer] = {
@@ -398,31 +362,18 @@ def test_an_agent_is_told_that_its_driver_waits_for_the_peer(stage: Stage) -> No
 
 def test_b_begins_when_a_does_and_counts_a_s_ticks(stage: Stage) -> None:
     """b is seven ticks late: it passes through these at once without moving, then drives in a's ticks."""
-    driver = Recorded()
-    driver.clock = stage.monotonic
-    config = config_of(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
-    field = Field(driver, config, "r", stage, max_ticks=12, manoeuvre_s=MANOEUVRE_S)
-
-    def answer(key: str, frame: bytes) -> None:
-        if key == keys.observation("r", "b"):
-            observation = decode(frame, Observation | MissionEnd | FinalReport)
-            said = command(observation.tick, "b") if isinstance(observation, Observation) else FINAL_REPORT
-            stage.comes("command", keys.command("r", "b"), encode(said), 0.001)
-
-    stage.answer = answer
+    b = Member(stage, assured("b"), 12)
     stage.alive("b")
     later = 0.5 + 2.5 * MANOEUVRE_S
     for tick, after in ((7, 0.5), (0, later), (500, later)):  # tick 0 is of an a that lost its journal
-        stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(tick, "a")), after)
-    field.attach(LINK)
-    end = field.run_mission(10.0, lambda: None)
-    assert end.tick == 12
-    assert driver.ticks[0][1] == pytest.approx(0.5)
-    assert [tick for tick, _ in driver.ticks] == list(range(13))
-    assert driver.ticks[7][1] == pytest.approx(0.5)
-    assert field.missed == 7
+        begins(stage, "a", {tick: after})
+    assert b.play().tick == 12
+    assert b.times[0] == pytest.approx(0.5)
+    assert [*b.times] == list(range(13))
+    assert b.times[7] == pytest.approx(0.5)
+    assert b.field.missed == 7
     assert stage.refused["tick-start"] == 2
-    assert len(driver.commands) == 6
+    assert len(b.driver.commands) == 6
 
 
 def history_of(ticks: int, *, robot: str) -> DriverHistory:
@@ -441,36 +392,21 @@ def history_of(ticks: int, *, robot: str) -> DriverHistory:
 @pytest.mark.parametrize(("robot", "peer"), ["ab", "ba"])
 def test_a_robot_that_was_down_catches_up_with_its_peer_standing(robot: str, peer: str, stage: Stage) -> None:
     """For any number of ticks without the process; it then continues in the ticks of the peer."""
-    driver = Recorded()
-    driver.clock = stage.monotonic
-    config = config_of(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
-    field = Field(driver, config, "r", stage, max_ticks=305, manoeuvre_s=MANOEUVRE_S)
-    field.resume(history_of(20, robot=robot), latest=17)
-    sent: list[int] = []
-
-    def answer(key: str, frame: bytes) -> None:
-        if key == keys.observation("r", robot):
-            observation = decode(frame, Observation | MissionEnd | FinalReport)
-            sent.extend([observation.tick] if isinstance(observation, Observation) else [])
-            said = (
-                command(observation.tick, robot)
-                if isinstance(observation, Observation)
-                else replace(FINAL_REPORT, robot=robot)
-            )
-            stage.comes("command", keys.command("r", robot), encode(said), 0.001)
-
-    stage.answer = answer
+    one = Member(stage, assured(robot), 305)
+    one.field.resume(history_of(20, robot=robot), latest=17)
     stage.alive(robot)
-    stage.comes("tick-start", keys.tick_start("r", peer), encode(TickStart(300, peer)), 0.01)
-    field.attach(LINK)
-    end = field.run_mission(10.0, lambda: None)
-    assert end.tick == 305
-    assert sent == list(range(18, 306))
-    assert [tick for tick, _ in driver.ticks] == list(range(20, 306))
-    times = dict(driver.ticks)
-    assert times[299] - times[21] < 2 * (1 + THINKING) * MANOEUVRE_S
-    assert times[305] - times[301] == pytest.approx(4 * (1 + THINKING) * MANOEUVRE_S)
-    assert 5 <= len(driver.commands) <= 7
+    begins(stage, peer, {300: 0.01})
+    assert one.play().tick == 305
+    sent = [
+        decode(frame, Observation | MissionEnd | FinalReport)
+        for key, frame in stage.put_frames
+        if key == keys.observation("r", robot)
+    ]
+    assert [seen.tick for seen in sent if isinstance(seen, Observation)] == list(range(18, 306))
+    assert [*one.times] == list(range(20, 306))
+    assert one.times[299] - one.times[21] < 2 * TICK_S
+    assert one.times[305] - one.times[301] == pytest.approx(4 * TICK_S)
+    assert 5 <= len(one.driver.commands) <= 7
 
 
 def test_a_restarted_robot_whose_peer_comes_later_is_no_more_behind_than_the_peer(stage: Stage) -> None:
@@ -479,44 +415,35 @@ def test_a_restarted_robot_whose_peer_comes_later_is_no_more_behind_than_the_pee
     It has nothing to catch up with, so it says where it is. Otherwise the peer would count its own ticks, and
     this robot would be late in all of them.
     """
-    tick_s = (1 + THINKING) * MANOEUVRE_S
     peer = {"starts": 3.0}
 
     class Waits(Recorded):
         def sense(self, tick: int) -> Reading:
             stage.now = max(stage.now, peer["starts"])
-            peer["starts"] += tick_s
+            peer["starts"] += TICK_S
             return super().sense(tick)
 
-    driver = Waits()
-    driver.clock = stage.monotonic
-    field = Field(driver, CONFIG, "r", stage, max_ticks=90, manoeuvre_s=MANOEUVRE_S)
-    field.resume(history_of(20, robot="a"), latest=19)
+    a = Member(stage, CONFIG, 90, driver=Waits())
+    a.field.resume(history_of(20, robot="a"), latest=19)
+    agent = stage.answer
 
     def answer(key: str, frame: bytes) -> None:
         if key == keys.tick_start("r", "a"):
             peer["starts"] = min(peer["starts"], max(stage.now, 3.0))
-        if key == keys.observation("r", "a"):
-            observation = decode(frame, Observation | MissionEnd | FinalReport)
-            said = command(observation.tick) if isinstance(observation, Observation) else FINAL_REPORT
-            stage.comes("command", keys.command("r", "a"), encode(said), 0.001)
+        agent(key, frame)
 
     stage.answer = answer
     stage.alive("a", "b")
-    field.attach(LINK)
-    field.run_mission(10.0, lambda: None)
-    starts = [
-        decode(frame, TickStart).tick for key, frame in stage.put_frames if key == keys.tick_start("r", "a")
-    ]
-    assert starts == list(range(20, 91))
-    assert len(driver.commands) > 40
+    a.play()
+    assert a.started() == list(range(20, 91))
+    assert len(a.driver.commands) > 40
 
 
 def test_an_a_that_was_not_down_does_not_go_by_its_peers_ticks(stage: Stage, played: Play) -> None:
     driver = Recorded()
     stage.comes("tick-start", keys.tick_start("r", "b"), encode(TickStart(4, "b")), 0.05)
     played(driver, lambda tick: [encode(command(tick))])
-    assert driver.ticks[-1][1] - driver.ticks[0][1] == pytest.approx(5 * (1 + THINKING) * MANOEUVRE_S)
+    assert driver.ticks[-1][1] - driver.ticks[0][1] == pytest.approx(5 * TICK_S)
 
 
 @pytest.mark.parametrize("killed", [True, False])
@@ -524,22 +451,15 @@ def test_a_b_that_has_missed_the_start_of_tick_0_begins_though_a_waits_for_it(
     killed: bool, stage: Stage
 ) -> None:
     """a is present, but sends nothing. When it does, it is behind, and b waits for it."""
-    driver = Recorded()
-    driver.clock = stage.monotonic
-    config = config_of(parse(ASSURED, "assured"), "b", MANOEUVRE_S)
-    field = Field(driver, config, "r", stage, max_ticks=9, manoeuvre_s=MANOEUVRE_S)
+    b = Member(stage, assured("b"), 9)
     if killed:
-        field.resume(DriverHistory(), latest=-1)
+        b.field.resume(DriverHistory(), latest=-1)
     stage.alive("a", "b")
-    tick_s = (1.0 + THINKING) * MANOEUVRE_S
-    stage.comes("tick-start", keys.tick_start("r", "a"), encode(TickStart(0, "a")), 9.5 * tick_s)
-    field.attach(LINK)
-    end = field.run_mission(10.0, lambda: None)
-    times = dict(driver.ticks)
-    assert times[0] == pytest.approx(UNHEARD * tick_s, abs=1e-3)  # it counts from the connection on
-    assert times[5] == pytest.approx(times[0] + 5 * tick_s)
-    assert times[6] == pytest.approx((9.5 + 6) * tick_s)
-    assert end.tick == 9
+    begins(stage, "a", {0: 9.5 * TICK_S})
+    assert b.play().tick == 9
+    assert b.times[0] == pytest.approx(UNHEARD * TICK_S, abs=1e-3)  # it counts from the connection on
+    assert b.times[5] == pytest.approx(b.times[0] + 5 * TICK_S)
+    assert b.times[6] == pytest.approx((9.5 + 6) * TICK_S)
 
 
 def test_a_mission_ends_though_zenoh_takes_its_end_never(
@@ -578,18 +498,12 @@ def test_a_robot_prints_the_reason_for_a_missing_final_report(
 def test_a_robot_that_was_killed_waits_for_its_agent_however_long_its_peer_is_there(
     robot: str, stage: Stage
 ) -> None:
-    driver = Recorded()
-    driver.clock = stage.monotonic
-    config = config_of(parse(ASSURED, "assured"), robot, MANOEUVRE_S)
-    field = Field(driver, config, "r", stage, max_ticks=25, manoeuvre_s=MANOEUVRE_S)
-    field.resume(history_of(20, robot=robot), latest=19)
+    one = Member(stage, assured(robot), 25)
+    one.field.resume(history_of(20, robot=robot), latest=19)
     stage.alive("b" if robot == "a" else "a")
     stage.comes("alive", keys.robot_alive("r", robot), after=3.0)
-    field.attach(LINK)
-    assert field.run_mission(10.0, lambda: None).tick == 25
-    tick, began = driver.ticks[0]
-    assert tick == 20
-    assert began == pytest.approx(3.0)
+    assert one.play().tick == 25
+    assert one.driver.ticks[0] == pytest.approx((20, 3.0))
 
 
 def test_a_robot_with_a_slow_driver_receives_the_commands_of_its_agent(stage: Stage, played: Play) -> None:

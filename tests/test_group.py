@@ -32,6 +32,7 @@ from protocol.motion import Pose, step
 from protocol.orbits import SHORT_OF_ANCHOR, search_legs, search_ticks
 from protocol.wire import MAX_REPORT_BYTES, encode
 from tests.groups import R, group_of, localised, table_of
+from tests.missions import outcome
 from tests.series import series
 from world.referee import mistake
 
@@ -57,8 +58,7 @@ def test_all_robots_of_a_group_are_localised_before_the_bound_of_its_plan(group:
 @pytest.mark.parametrize("group", series([(3, 2), (4, 1), (8, 2), (4, 9)], 2))
 def test_a_group_with_noisy_ranges_is_localised_as_accurately_as_it_claims(group: tuple[int, int]) -> None:
     run = run_mission(group_of(*group, sigma=0.05))
-    assert run.end is not None
-    assert run.end.outcome == "localised"
+    assert outcome(run) == "localised"
     for robot in run.robots:
         claim = run.claim(robot)
         assert claim is not None

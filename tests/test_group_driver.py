@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +17,6 @@ from protocol.messages import (
     Cause,
     Command,
     Contact,
-    FinalReport,
     Inconsistent,
     Localised,
     MissionEnd,
@@ -31,17 +29,15 @@ from protocol.messages import (
 from protocol.motion import ORIGIN, REST
 from protocol.network import keys
 from protocol.wire import decode, encode
-from tests.stage import Stage
-from tests.test_driver import FINAL_REPORT, LINK, MANOEUVRE_S, Recorded, command
+from tests.stage import MANOEUVRE_S, TICK_S, Member, Stage, begins, command
 from tests.test_group_field import FAR
-from world.hardware.bridge import Field, NoStart
-from world.hardware.driver import THINKING, Reading
+from world.hardware.bridge import NoStart
+from world.hardware.driver import Reading
 from world.hardware.driver_journal import driver_history
 from world.hardware.measurements import InvalidReading, observation_frame
 from world.hardware.termination import LAST_WORDS, Ending
 from world.hardware.tick_source import UNHEARD, TickSource
 
-TICK_S = (1.0 + THINKING) * MANOEUVRE_S
 LOCALISED = Localised(ORIGIN)
 
 
@@ -54,61 +50,17 @@ def stage(monkeypatch: pytest.MonkeyPatch) -> Stage:
     return Stage(monkeypatch)
 
 
-class Member:
-    """A robot of the group on a stage, whose agent answers each Observation at once."""
-
-    def __init__(
-        self,
-        stage: Stage,
-        robot: str,
-        max_ticks: int,
-        verdict: Verdict | None = None,
-        journal: Sink | None = None,
-        tolerates: int = 0,
-    ) -> None:
-        self.driver = Recorded()
-        self.driver.clock = stage.monotonic
-        self._stage, self._robot, self._verdict = stage, robot, verdict
-        self.field = Field(
-            self.driver,
-            replace(config_in_group(robot), tolerates=tolerates),
-            "r",
-            stage,
-            max_ticks=max_ticks,
-            manoeuvre_s=MANOEUVRE_S,
-            journal=journal,
-        )
-        stage.answer = self._answer
-
-    def _answer(self, key: str, frame: bytes) -> None:
-        if key == keys.observation("r", self._robot):
-            message = decode(frame, Observation | TickStart | MissionEnd | FinalReport)
-            said = (
-                command(message.tick, self._robot, verdict=self._verdict)
-                if isinstance(message, Observation)
-                else replace(FINAL_REPORT, robot=self._robot)
-            )
-            self._stage.comes("command", keys.command("r", self._robot), encode(said), 0.001)
-
-    def play(self, wait: float = 10.0) -> MissionEnd:
-        self.field.attach(LINK)
-        return self.field.run_mission(wait, lambda: None)
-
-    @property
-    def times(self) -> dict[int, float]:
-        """The time of each tick."""
-        return dict(self.driver.ticks)
-
-    def started(self) -> list[int]:
-        """Return the ticks of the TickStarts that it has sent."""
-        key = keys.tick_start("r", self._robot)
-        return [decode(frame, TickStart).tick for to, frame in self._stage.put_frames if to == key]
-
-
-def begins(stage: Stage, robot: str, ticks: Mapping[int, float]) -> None:
-    """Let the driver of `robot` send the TickStart of each of `ticks` at its time."""
-    for tick, at in ticks.items():
-        stage.comes("tick-start", keys.tick_start("r", robot), encode(TickStart(tick, robot)), at)
+def member(
+    stage: Stage,
+    robot: str,
+    max_ticks: int,
+    verdict: Verdict | None = None,
+    journal: Sink | None = None,
+    tolerates: int = 0,
+) -> Member:
+    """Return a robot of the group on a stage."""
+    config = replace(config_in_group(robot), tolerates=tolerates)
+    return Member(stage, config, max_ticks, verdict, journal)
 
 
 # --- whose ticks --------------------------------------------------------------------------------------
@@ -127,7 +79,7 @@ def test_each_robot_counts_the_ticks_of_the_first_one_that_it_hears() -> None:
 
 def test_a_robot_whose_source_falls_silent_counts_the_ticks_of_the_next_one(stage: Stage) -> None:
     """Robot a is dead after tick 4. Until c has missed it, it uses its own clock."""
-    c = Member(stage, "c", 14)
+    c = member(stage, "c", 14)
     stage.alive("a", "b", "c", "d")
     begins(stage, "a", {tick: 0.1 + tick * TICK_S for tick in range(5)})
     late = 0.4 * TICK_S
@@ -141,7 +93,7 @@ def test_a_robot_whose_source_falls_silent_counts_the_ticks_of_the_next_one(stag
 
 def test_a_robot_that_comes_late_catches_up_at_rest_though_it_is_the_first(stage: Stage) -> None:
     """Others do not receive its TickStarts while it is behind, or they would wait for it."""
-    a = Member(stage, "a", 104)
+    a = member(stage, "a", 104)
     stage.alive("a", "c")
     begins(stage, "c", {tick: 0.5 + (tick - 100) * TICK_S for tick in range(100, 105)})
     assert a.play().tick == 104
@@ -153,7 +105,7 @@ def test_a_robot_that_comes_late_catches_up_at_rest_though_it_is_the_first(stage
 
 def test_the_first_robot_catches_up_if_it_is_behind_the_others(stage: Stage) -> None:
     """As after a link between two parts of a group that began without each other."""
-    a = Member(stage, "a", 45)
+    a = member(stage, "a", 45)
     stage.alive("a", "b", "c", "d")
     begins(stage, "d", {tick: (tick - 30) * TICK_S + 0.05 for tick in range(33, 46)})
     assert a.play().tick == 45
@@ -162,7 +114,7 @@ def test_the_first_robot_catches_up_if_it_is_behind_the_others(stage: Stage) -> 
 
 
 def test_the_first_robot_does_not_count_the_ticks_of_others(stage: Stage) -> None:
-    a = Member(stage, "a", 9)
+    a = member(stage, "a", 9)
     stage.alive("a", "b", "c", "d")
     begins(stage, "b", {tick: (tick - 1.5) * TICK_S + 0.05 for tick in range(2, 10)})
     a.play()
@@ -171,7 +123,7 @@ def test_the_first_robot_does_not_count_the_ticks_of_others(stage: Stage) -> Non
 
 def test_a_robot_begins_when_any_other_one_does(stage: Stage) -> None:
     """Here d, whose connection timeout was over first. It is after c in the mission."""
-    c = Member(stage, "c", 3)
+    c = member(stage, "c", 3)
     stage.alive("c", "d")
     begins(stage, "d", {0: 0.5})
     assert c.play().tick == 3
@@ -182,19 +134,19 @@ def test_a_robot_begins_when_any_other_one_does(stage: Stage) -> None:
 def test_a_group_begins_without_those_that_do_not_come(
     robot: str, stage: Stage, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    member = Member(stage, robot, 3)
+    one = member(stage, robot, 3)
     stage.alive("a", "c")
-    assert member.play(2.0).tick == 3
-    assert member.times[0] == pytest.approx(2.0)
+    assert one.play(2.0).tick == 3
+    assert one.times[0] == pytest.approx(2.0)
     assert "b and d: not connected; the mission begins" in capsys.readouterr().err
 
 
 def test_a_robot_of_a_group_that_is_alone_does_not_begin(stage: Stage) -> None:
-    member = Member(stage, "b", 3)
+    one = member(stage, "b", 3)
     stage.alive("b")
     with pytest.raises(NoStart, match="a and c and d: not connected; no robot has moved"):
-        member.play(2.0)
-    assert member.driver.commands == []
+        one.play(2.0)
+    assert one.driver.commands == []
 
 
 # --- false TickStarts ---------------------------------------------------------------------------------
@@ -212,16 +164,16 @@ def test_a_robot_that_says_it_is_ahead_leads_none_of_those_that_tolerate_it(
     ahead: int, robot: str, stage: Stage
 ) -> None:
     """Robot d is ahead from before the start on, and ever more."""
-    member = Member(stage, robot, 30, tolerates=1)
+    one = member(stage, robot, 30, tolerates=1)
     begins(stage, "d", {ahead * (1 + k): 0.05 + 0.5 * k * TICK_S for k in range(60)})
     stage.comes("alive", keys.robot_alive("r", robot))
     for other in "abcd".replace(robot, ""):
         stage.comes("alive", keys.robot_alive("r", other), after=0.09)
     in_step(stage, "abc".replace(robot, ""), 30)
-    assert member.play().tick == 30
-    assert member.times[30] - member.times[5] == pytest.approx(25 * TICK_S, rel=0.01)
-    assert member.field.missed <= 1
-    assert member.started()[-25:] == list(range(6, 31))
+    assert one.play().tick == 30
+    assert one.times[30] - one.times[5] == pytest.approx(25 * TICK_S, rel=0.01)
+    assert one.field.missed <= 1
+    assert one.started()[-25:] == list(range(6, 31))
 
 
 @pytest.mark.parametrize("robot", ["b", "c", "d"])
@@ -230,18 +182,18 @@ def test_a_first_robot_with_a_false_clock_changes_no_ticks_of_those_that_tolerat
     lasts: float, robot: str, stage: Stage
 ) -> None:
     """Robot a sends each TickStart twice, and its ticks last too short or too long."""
-    member = Member(stage, robot, 30, tolerates=1)
+    one = member(stage, robot, 30, tolerates=1)
     stage.alive("a", "b", "c", "d")
     for repeated in (0.0, 0.1 * TICK_S):
         begins(stage, "a", {tick: 0.1 + repeated + lasts * tick * TICK_S for tick in range(60)})
     in_step(stage, "bcd".replace(robot, ""), 31)
-    assert member.play().tick == 30
-    assert member.times[30] - member.times[0] == pytest.approx(30 * TICK_S, rel=0.01)
-    assert member.field.missed == 0
+    assert one.play().tick == 30
+    assert one.times[30] - one.times[0] == pytest.approx(30 * TICK_S, rel=0.01)
+    assert one.field.missed == 0
 
 
 def test_a_robot_that_was_down_catches_up_with_honest_ones_beside_a_false_one(stage: Stage) -> None:
-    b = Member(stage, "b", 60, tolerates=1)
+    b = member(stage, "b", 60, tolerates=1)
     b.field.resume(driver_history([], config_in_group("b"), Path("b")), latest=-1)
     stage.alive("a", "b", "c", "d")
     begins(stage, "a", {tick: 0.05 + (tick - 50) * TICK_S for tick in range(50, 90)})
@@ -255,7 +207,7 @@ def test_a_robot_that_was_down_catches_up_with_honest_ones_beside_a_false_one(st
 def test_a_robot_that_is_ahead_of_all_others_waits_for_them_in_a_group_that_tolerates_false_ones(
     stage: Stage,
 ) -> None:
-    a = Member(stage, "a", 20, tolerates=1)
+    a = member(stage, "a", 20, tolerates=1)
     stage.alive("a", "b", "c", "d")
     in_step(stage, "bcd", 20, since=1.5 * TICK_S)
     a.play()
@@ -263,7 +215,7 @@ def test_a_robot_that_is_ahead_of_all_others_waits_for_them_in_a_group_that_tole
 
 
 def test_a_first_robot_that_repeats_a_tick_start_delays_others_for_a_bounded_time(stage: Stage) -> None:
-    c = Member(stage, "c", 9)
+    c = member(stage, "c", 9)
     stage.alive("a", "b", "c", "d")
     begins(stage, "a", {tick: 0.1 + tick * TICK_S for tick in range(4)})
     repeated = encode(TickStart(3, "a"))
@@ -275,7 +227,7 @@ def test_a_first_robot_that_repeats_a_tick_start_delays_others_for_a_bounded_tim
 
 def test_a_false_tick_start_before_the_first_one_hides_no_results(stage: Stage) -> None:
     """Here the group tolerates no false robot, but the first one says at once that it begins."""
-    c = Member(stage, "c", 200, LOCALISED)
+    c = member(stage, "c", 200, LOCALISED)
     stage.alive("a", "b", "c", "d")
     begins(stage, "d", {150: 0.1})
     in_step(stage, "ab", 1)
@@ -452,7 +404,7 @@ def test_a_robot_without_a_result_ends_at_max_ticks(ending: Ending) -> None:
 
 def test_results_are_journaled_once_when_they_are_received(stage: Stage) -> None:
     journal = MemoryJournal()
-    a = Member(stage, "a", 9, LOCALISED, journal)
+    a = member(stage, "a", 9, LOCALISED, journal)
     stage.alive("a", "b", "c", "d")
     for tick in range(3):
         for robot in "bc":
@@ -466,7 +418,7 @@ def test_results_are_journaled_once_when_they_are_received(stage: Stage) -> None
 def test_a_tick_start_of_an_unexpected_tick_changes_nothing(stage: Stage) -> None:
     """One that a robot sent before its result arrives late; ticks far ahead are those of no robot."""
     journal = MemoryJournal()
-    a = Member(stage, "a", 9, LOCALISED, journal)
+    a = member(stage, "a", 9, LOCALISED, journal)
     stage.alive("a", "b", "c", "d")
     starts = [result("b"), replace(result("b", None), tick=1), replace(result("c"), tick=10_000)]
     for place, start in enumerate([replace(starts[0], tick=2), *starts[1:]]):
@@ -484,7 +436,7 @@ def test_results_that_were_received_are_known_after_a_restart(stage: Stage, tmp_
     frames += [encode(result(robot)) for robot in "bcd"]
     history = driver_history(frames, config, tmp_path)
     assert [one.robot for one in history.ticks[0].received] == ["b", "c", "d"]
-    a = Member(stage, "a", 100, LOCALISED)
+    a = member(stage, "a", 100, LOCALISED)
     a.field.resume(history, latest=0)
     stage.alive("a", "b", "c", "d")
     assert a.play() == MissionEnd(LAST_WORDS, "localised")

@@ -34,19 +34,10 @@ from compose.view.series import series
 from compose.view.web.sources import Recorded
 from protocol.journal import journal_file
 from protocol.journal.journal_file import packed
-from protocol.messages import (
-    Command,
-    Contact,
-    Estimate,
-    GroundTruth,
-    Localised,
-    Message,
-    Observation,
-    Report,
-)
+from protocol.messages import Command, Contact, Estimate, GroundTruth, Localised, Message, Observation, Report
 from protocol.motion import Pose
 from tests.browser import Open, inks, scrub_to, shot, watching
-from tests.commands import SECTION_IV, anchored, tandem
+from tests.commands import SECTION_IV, anchored, copied, tandem
 from tests.conftest import recorded
 
 WAYS = {
@@ -399,10 +390,7 @@ def test_the_sheet_of_the_group_has_the_tree_and_the_tick_of_each_claim(
 
 @pytest.mark.long
 def test_tandem_figures_draws_a_group_and_no_such_sheet_for_a_pair(folder: Path, tmp_path: Path) -> None:
-    copy = tmp_path / "recording"
-    copy.mkdir()
-    for path in folder.glob("*.journal"):
-        (copy / path.name).write_bytes(path.read_bytes())
+    copy = copied(folder, tmp_path / "recording")
     drawn = tandem("figures", str(copy), "--format", "svg", "--only", "meetings", "--only", "ranges")
     assert drawn.status == 0, drawn.err
     names = {path.stem for path in (copy / "figures").iterdir()}

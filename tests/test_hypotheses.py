@@ -43,11 +43,7 @@ from agent.estimation.posterior import NO_HYPOTHESES, Hypothesis, Posterior, fol
 from agent.estimation.smoother import Singular
 from protocol.motion import Pose, step, wrap
 from protocol.noise import Noise, VelocityNoise
-from tests.hypotheses_by_numpy import (
-    anchors_by_numpy,
-    detections_by_numpy,
-    turned_by_numpy,
-)
+from tests.hypotheses_by_numpy import anchors_by_numpy, detections_by_numpy, turned_by_numpy
 from tests.pair_starts import alone, kinds, pair_fit, with_ranges
 
 REACH = 3.0

@@ -27,12 +27,7 @@ from compose.launch.in_process import run_mission
 from compose.recording.claim_errors import nees
 from compose.recording.recording_files import agent_journal
 from compose.recording.run import Run, of_frames
-from protocol.messages import (
-    Localised,
-    Report,
-    ReportedPose,
-    Undecided,
-)
+from protocol.messages import Localised, Report, ReportedPose, Undecided
 from protocol.motion import Covariance
 from protocol.wire import MAX_REPORT_BYTES, decode, encode
 from tests.commands import TandemProcess

@@ -15,11 +15,7 @@ from agent.estimation.gaussian.beacon_guesses import start_of
 from agent.estimation.gaussian.consistency import beta_binomial_tail, f_tail, fisher, sigmas
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.noise_level import LEAST_LEVEL, noise_level, residual_correlation
-from agent.estimation.gaussian.odometry_noise import (
-    Array,
-    Track,
-    track,
-)
+from agent.estimation.gaussian.odometry_noise import Array, Track, track
 from agent.estimation.gaussian.own_sensors import doubt
 from agent.estimation.gaussian.range_model import inlier_probability
 from agent.estimation.gaussian.range_weights import Weighing, weights_by_errors

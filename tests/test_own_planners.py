@@ -31,14 +31,7 @@ from compose.launch.processes import free_endpoint
 from compose.recording.run import read
 from compose.scenario.scenario_file import ScenarioTemplate, load, setting, validate
 from compose.terminal.finding import WRONG
-from protocol.messages import (
-    MAX_BODY_BYTES,
-    Inconsistent,
-    Localised,
-    Observation,
-    Report,
-    Undecided,
-)
+from protocol.messages import MAX_BODY_BYTES, Inconsistent, Localised, Observation, Report, Undecided
 from protocol.motion import ORIGIN, Covariance, Pose
 from protocol.network import keys
 from protocol.network.inbox import Arrival

@@ -20,7 +20,7 @@ from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Observation
 from protocol.wire import MAX_FRAME_BYTES, MalformedFrame, decode
 from tests.browser import Open, inks, picture, scrub_to, shot, stop_clock, until_shown, watching
-from tests.commands import ENDLESS, TandemProcess, until, world
+from tests.commands import ENDLESS, TandemProcess, copied, until, world
 from tests.series import series
 from world.referee import errors
 
@@ -297,8 +297,7 @@ def test_a_robot_that_joins_is_on_the_timeline_once_the_page_has_its_setup(
 def test_without_the_truth_the_page_opens_with_the_estimates(
     dark: bool, opened: Open, paper_1: Path, tmp_path: Path
 ) -> None:
-    for path in paper_1.glob("agent-*.journal"):
-        (tmp_path / path.name).write_bytes(path.read_bytes())
+    copied(paper_1, tmp_path, "agent-a.journal", "agent-b.journal")
     with watching(tmp_path) as (_, where):
         page = opened(where, height=720, dark=dark)
         until_shown(page, 0)
@@ -322,8 +321,7 @@ def test_without_the_truth_the_page_opens_with_the_estimates(
 def test_the_error_is_that_of_the_likeliest_pose_or_else_a_range(
     opened: Open, paper_1: Path, address: str
 ) -> None:
-    page = opened(f"{address}#tick=47", height=720)
-    until_shown(page, 47)
+    page = opened(address, tick=47, height=720)
     truth = read(paper_1).ticks[47].truth.poses[1]
     off = sorted(errors(pose, truth)[0] for pose in read(paper_1).estimates("b")[47].world)
     assert len(off) == 4
@@ -365,8 +363,7 @@ TIMELESS = """() => {
 def test_space_after_a_click_plays_and_pauses_and_does_nothing_else(
     opened: Open, address: str, click: str
 ) -> None:
-    page = opened(f"{address}#tick=20")
-    until_shown(page, 20)
+    page = opened(address, tick=20)
     page.keyboard.press("[")
     page.keyboard.press("[")
     page.keyboard.press("[")
@@ -394,16 +391,14 @@ def state(page: Page) -> list[object]:
 @pytest.mark.long
 def test_space_plays_though_the_closed_help_still_has_the_focus(opened: Open, address: str) -> None:
     """For a moment after it closes, longer on a slow machine, keys still go to its button."""
-    page = opened(f"{address}#tick=45")
-    until_shown(page, 45)
+    page = opened(address, tick=45)
     page.locator("#keys button").first.dispatch_event("keydown", {"key": " ", "bubbles": True})
     until_shown(page, 48)
 
 
 @pytest.mark.long
 def test_who_goes_by_keyboard_presses_a_button_with_space(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=20")
-    until_shown(page, 20)
+    page = opened(address, tick=20)
     page.locator("#back").focus()
     page.keyboard.press("Space")
     until_shown(page, 19)
@@ -412,8 +407,7 @@ def test_who_goes_by_keyboard_presses_a_button_with_space(opened: Open, address:
 
 @pytest.mark.long
 def test_the_speed_box_takes_only_the_keys_that_choose_a_speed(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=20")
-    until_shown(page, 20)
+    page = opened(address, tick=20)
     speed = page.locator("#speed")
     speed.focus()
     for key, tick in (("ArrowRight", 21), ("ArrowLeft", 20), ("Shift+ArrowRight", 30), ("Home", 0), (".", 1)):

@@ -23,16 +23,7 @@ from protocol.journal import journal_file
 from protocol.journal.journal_file import Journal
 from protocol.messages import Command, Estimate, Observation
 from protocol.mission import Anchor
-from tests.browser import (
-    BOUND_MS,
-    Open,
-    chromium_only,
-    scrub_to,
-    shot,
-    until_loaded,
-    until_shown,
-    watching,
-)
+from tests.browser import BOUND_MS, Open, chromium_only, scrub_to, shot, until_loaded, until_shown, watching
 from tests.commands import BENT, tandem
 from tests.series import series as cases
 from tests.test_accessibility import violations
@@ -198,8 +189,7 @@ def test_a_click_in_the_charts_goes_to_the_tick_whose_values_it_shows(
 ) -> None:
     run = read(noisy)
     last = run.length - 1
-    page = opened(f"{served}#tick=3")
-    until_shown(page, 3)
+    page = opened(served, tick=3)
     charts = page.locator(CHARTS)
     expect(charts).to_be_hidden()
     page.keyboard.press("v")
@@ -265,8 +255,7 @@ def test_the_page_in_one_file_has_the_charts(browser: Browser, noisy: Path, tmp_
 
 @pytest.mark.long
 def test_a_mission_with_exact_sensors_says_that_it_has_no_sigma(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=47")
-    until_shown(page, 47)
+    page = opened(address, tick=47)
     page.keyboard.press("v")
     until_read(page, 47)
     expect(page.locator(CHARTS)).to_have_attribute(

@@ -35,21 +35,7 @@ from protocol.messages import (
 from protocol.mission import Anchor
 from protocol.motion import Covariance, Segment
 from tests.commands import SECTION_IV, anchored, several_pairs
-from tests.planted import (
-    LAST,
-    A,
-    B,
-    Edit,
-    audit,
-    found,
-    messages,
-    nothing,
-    of,
-    plant,
-    to,
-    what,
-    written,
-)
+from tests.planted import LAST, A, B, Edit, audit, found, messages, nothing, of, plant, to, what, written
 from world.scenario import Scenario
 
 

@@ -26,8 +26,7 @@ from docs import plaza_csv
 from protocol.motion import ORIGIN, Controls, Pose, compose, step, wrap
 from protocol.noise import VelocityNoise
 from tests.commands import tandem
-from tests.range_tables import SAMPLE, SIGMAS, TABLES, written_csv, written_mcap
-from tests.test_bad_recordings import POSE, refused
+from tests.range_tables import POSE, SAMPLE, SIGMAS, TABLES, refused, written_csv, written_mcap
 from tests.uwb_sample import NAMES
 
 MAX_SAMPLE_BYTES = 350_000

@@ -1,7 +1,8 @@
-"""No folder chooses code, and work that a request to the page starts is bounded and stopped."""
+"""No folder chooses code, requested work and documents are bounded, and modules that clash are named."""
 
 from __future__ import annotations
 
+import ast
 import asyncio
 import http.client
 import json
@@ -9,7 +10,8 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager
 from pathlib import Path
 from signal import SIGINT
 from typing import Any
@@ -20,10 +22,12 @@ import msgspec
 import pytest
 
 import tandem
-from compose.errors import UserError
+from compose.errors import USER_ERROR, NotToml, UserError
 from compose.launch import class_loader
+from compose.recording.run import read
 from compose.scenario.shipped_files import shipped
 from compose.scenario.toml_file import table_in
+from compose.sweep import results_folder, spec
 from compose.sweep.cells import cell_at, cells
 from compose.sweep.results_folder import Manifest
 from compose.sweep.spec import Axis, Sweep
@@ -33,8 +37,13 @@ from compose.view.web import reruns, results_page
 from compose.view.web.requested_work import RequestedWork
 from compose.view.web.server import application
 from compose.view.web.site import Site
+from compose.view.web.sources import Recorded
+from protocol import documents
+from protocol.documents import MOST_NESTED, Syntax, TooNested, check_nesting
+from protocol.network.endpoints import BadConfiguration, configured
+from tandem import clash
 from tests.browser import watching
-from tests.commands import ENDLESS, PAPER_1, Ended, processes_of, until
+from tests.commands import ENDLESS, PAPER_1, Ended, copied, processes_of, until
 from tests.commands import tandem as command
 from tests.series import series
 
@@ -260,3 +269,184 @@ def posted(site: Site, path: str, client: str) -> tuple[int, Any]:
     scope["headers"] = [(b"host", b"localhost")]
     asyncio.run(application(site)(scope, receive, send))
     return sent[0]["status"], json.loads(sent[1]["body"])
+
+
+NESTED = 100_000 * '{"a":'
+PARSERS = {"msgspec.json.decode", "msgspec.json.Decoder", "msgspec.toml.decode", "json.loads", "json.load"}
+"""The functions that parse what `protocol.documents` checks."""
+OWN = {
+    "compose/view/foxglove/layout.py",  # what a library returned
+    "protocol/network/endpoints.py",  # what Zenoh returned of a configuration that was checked
+    "protocol/documents.py",
+}
+
+
+def test_a_recording_with_nested_files_is_read_without_them(paper_1: Path, tmp_path: Path) -> None:
+    copied(paper_1, tmp_path)
+    for name in ("summary.json", "kills.jsonl"):
+        (tmp_path / name).write_text(f"{NESTED}\n")
+    note = f"{tmp_path / 'kills.jsonl'}: line 1: it is nested more than {MOST_NESTED} deep"
+    assert read(tmp_path).notes[0].startswith(note)
+    assert tandem.open(tmp_path).mode is None
+    show = Recorded("", tmp_path)
+    show.load()
+    assert show.setup is not None
+    assert show.notes[0].startswith(note)
+    for verb in ("audit", "replay"):
+        ended = command(verb, tmp_path)
+        assert ended.status == 0
+        assert ended.err.startswith(f"tandem {verb}: {note}")
+
+
+def test_nested_results_are_one_line(tmp_path: Path) -> None:
+    for name in ("sweep.json", "estimate.json"):
+        (tmp_path / name).write_text(NESTED)
+    sweep = spec.load("noise")
+    readers: list[Callable[[], Any]] = [
+        lambda: results_page.of_sweep(tmp_path),
+        lambda: results_page.of_estimate(tmp_path),
+        lambda: _entered(results_folder.opened(tmp_path, sweep)),
+    ]
+    for reader in readers:
+        with pytest.raises(UserError, match=f"nested more than {MOST_NESTED} deep"):
+            reader()
+
+
+def _entered(context: AbstractContextManager[Any]) -> None:
+    with context:
+        pass
+
+
+@pytest.mark.parametrize(
+    ("text", "syntax"),
+    [
+        ("[" * 100_000, "JSON"),
+        (NESTED, "JSON"),
+        (f"{'[' * 65}{']' * 65}", "JSON"),
+        (f"a{50_000 * '.a'} = 1", "TOML"),
+        (f"[a{50_000 * '.a'}]", "TOML"),
+        (f"a{33 * '.a'} = {{ a{33 * '.a'} = 1 }}", "TOML"),
+        (f"a = {'[' * 100_000}", "TOML"),
+        (f"// a 'comment'\n{NESTED}", "JSON5"),
+        (f"{{a: '\"', /* ' */ b: {'[' * 100_000}", "JSON5"),
+    ],
+)
+def test_what_is_nested_too_deeply_is_refused_before_it_is_parsed(
+    text: str, syntax: Syntax, tmp_path: Path
+) -> None:
+    began = time.process_time()
+    with pytest.raises(TooNested):
+        check_nesting(text, syntax)
+    if syntax == "TOML":
+        with pytest.raises(NotToml, match=r"^it: not TOML: it is nested"):
+            table_in(text, "it")
+    if syntax == "JSON5":
+        (tmp_path / "zenoh.json5").write_text(text)
+        with pytest.raises(BadConfiguration, match=r"zenoh\.json5: it is nested"):
+            configured(tmp_path / "zenoh.json5")
+    assert time.process_time() - began < 2.0
+
+
+@pytest.mark.parametrize(
+    ("text", "syntax"),
+    [
+        (json.dumps({"a": "[" * 1000, '"{' * 100: [[]] * 1000}), "JSON"),
+        (f"{'[' * 64}{']' * 64}", "JSON"),
+        (f"a = [{1000 * '0.5, '}]\n{''.join([f'b{i} = 1.5{chr(10)}' for i in range(100)])}", "TOML"),
+        (f"# {'[' * 99}\na = '{'[' * 99}'\nb = \"\"\"\"{'[' * 99}\"\"\"\nc = '''{'.' * 99}'''", "TOML"),
+        (f"{{ // {'[' * 99}\n /* {'{' * 99} */ a: '{'[' * 99}', b: \"'{'[' * 99}\" }}", "JSON5"),
+        *[(path.read_text(), "TOML") for path in shipped().values()],
+    ],
+)
+def test_brackets_in_strings_and_comments_do_not_nest(text: str, syntax: Syntax) -> None:
+    check_nesting(text, syntax)
+    if syntax != "JSON5":
+        (documents.json_value if syntax == "JSON" else documents.toml_table)(text)
+
+
+def test_a_document_that_is_too_large_is_not_read(tmp_path: Path) -> None:
+    with (tmp_path / "sweep.json").open("wb") as file:
+        file.truncate(10 << 30)
+    with pytest.raises(UserError, match=f"larger than {documents.MOST_DOCUMENT_BYTES} bytes"):
+        results_page.of_sweep(tmp_path)
+
+
+@pytest.mark.long
+def test_no_other_module_parses_documents() -> None:
+    root = Path(__file__).parents[1]
+    for package in ("agent", "compose", "protocol", "tandem", "world"):
+        for path in sorted((root / package).rglob("*.py")):
+            called = {
+                ast.unparse(node)
+                for node in ast.walk(ast.parse(path.read_text()))
+                if isinstance(node, ast.Attribute)
+            }
+            assert not called & PARSERS or str(path.relative_to(root)) in OWN, path
+
+
+ROOT = Path(__file__).parents[1]
+
+
+def ended(folder: Path, *words: str, path: Path | None = None) -> tuple[int, list[str]]:
+    """Return the exit status and the standard error of Python with `path` in front, run in `folder`."""
+    found = os.pathsep.join([str(one) for one in (path, ROOT) if one is not None])
+    ran = subprocess.run(
+        [sys.executable, *words],
+        cwd=folder,
+        env={**os.environ, "PYTHONPATH": found},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return ran.returncode, ran.stderr.splitlines()
+
+
+def module(folder: Path, name: str) -> Path:
+    """Return the file of a new package `name` in `folder`."""
+    file = folder / name / "__init__.py"
+    file.parent.mkdir()
+    file.write_text("")
+    return file
+
+
+@pytest.mark.parametrize("name", clash.PACKAGES)
+def test_the_command_names_the_module_that_clashes_and_where_it_is(name: str, tmp_path: Path) -> None:
+    file = module(tmp_path, name)
+    status, lines = ended(tmp_path, "-P", "-m", "tandem", "run", "paper-1", path=tmp_path)
+    assert status == USER_ERROR
+    assert len(lines) == 1
+    assert lines[0].startswith(f"tandem: the module '{name}' is {file}, but Tandem")
+    assert f"remove {tmp_path} from PYTHONPATH" in lines[0]
+
+
+def test_a_script_beside_such_a_module_gets_an_error_that_names_it(tmp_path: Path) -> None:
+    file = tmp_path / "world.py"
+    file.write_text("")
+    (tmp_path / "script.py").write_text("import tandem\ntandem.run('paper-1')\n")
+    status, lines = ended(tmp_path, "script.py")
+    assert status == 1
+    assert lines[-1].startswith(f"tandem.clash.ModuleClash: the module 'world' is {file}, ")
+    assert lines[-1].count(str(tmp_path)) == 2
+
+
+def test_a_module_that_a_script_has_imported_already_clashes(tmp_path: Path) -> None:
+    code = "import sys, types; sys.modules['agent'] = types.ModuleType('agent'); import tandem; tandem.Run"
+    status, lines = ended(tmp_path, "-P", "-c", code)
+    assert status == 1
+    assert "the module 'agent' is a module 'agent' without a file" in lines[-1]
+
+
+def test_a_folder_without_modules_does_not_clash(tmp_path: Path) -> None:
+    """Python prefers a package to a folder without `__init__.py`."""
+    (tmp_path / "world").mkdir()
+    assert ended(tmp_path, "-P", "-m", "tandem", "scenarios", path=tmp_path) == (0, [])
+
+
+def test_processes_of_a_run_import_what_their_launcher_imports(tmp_path: Path) -> None:
+    """The launcher finds Tandem first, by a path of its own; PYTHONPATH alone gives the user's module."""
+    module(tmp_path, "world").write_text("raise SystemExit('the wrong world')")
+    code = (
+        f"import sys; sys.path.insert(0, {str(ROOT)!r}); import tandem; "
+        "assert tandem.run('paper-1', processes=True).outcome == 'localised'"
+    )
+    assert ended(tmp_path, "-P", "-c", code, path=tmp_path) == (0, [])

@@ -49,6 +49,7 @@ from tests.commands import (
     PAPER_1,
     REAL_TIME,
     TandemProcess,
+    decided,
     journals,
     processes_of,
     refused,
@@ -63,19 +64,6 @@ from world.world_journal import world_history
 PARTS = ("agent-a", "agent-b", "world")
 LOCALISED = "localised after 48 ticks\n"
 REPEAT_S = 0.25
-
-
-@pytest.fixture(scope="module")
-def undisturbed(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the recording of the paper's first simulation, with contact from tick 46 to the end at 48."""
-    out = tmp_path_factory.mktemp("undisturbed") / "out"
-    assert tandem("run", "paper-1", "--in-process", "-q", "--out", out).status == 0
-    return out
-
-
-def same(out: Path, undisturbed: Path) -> None:
-    assert journals(out) == journals(undisturbed)
-    assert (out / "ticks.csv").read_bytes() == (undisturbed / "ticks.csv").read_bytes()
 
 
 def options(kills: str) -> list[str]:
@@ -111,7 +99,7 @@ def test_a_run_whose_processes_are_killed_ends_with_the_same_recording(
     assert sorted("@".join(one) for one in killed) == sorted(re.findall(r"\w+@\d+", kills))
     assert len(re.findall(r": back, replayed \d+ ticks?, identical$", ended.err, re.MULTILINE)) == len(killed)
     assert "the world has gone" not in ended.err
-    same(out, undisturbed)
+    assert decided(out) == decided(undisturbed)
     assert not processes_of(out)
 
 
@@ -122,7 +110,7 @@ def test_a_robot_that_comes_back_later_is_waited_for_even_after_the_last_tick(
     said = "tandem run: agent a was killed at tick 48, and is restarted in 0.5 s\n"
     said += "tandem agent a: back, replayed 49 ticks, identical\n"
     assert ended == (0, LOCALISED, said)
-    same(tmp_path / "out", undisturbed)
+    assert decided(tmp_path / "out") == decided(undisturbed)
 
 
 def test_a_kill_point_that_is_never_reached_is_reported(undisturbed: Path, tmp_path: Path) -> None:
@@ -134,7 +122,7 @@ def test_a_kill_point_that_is_never_reached_is_reported(undisturbed: Path, tmp_p
         "tandem run: --kill b@900: not reached",
         "tandem run: --kill world@49:command+never: not reached",
     ]
-    same(tmp_path / "out", undisturbed)
+    assert decided(tmp_path / "out") == decided(undisturbed)
 
 
 @pytest.mark.parametrize("who", ["b", "world"])
@@ -315,7 +303,7 @@ def test_a_truncated_tail_is_removed_and_reported(tick: int, undisturbed: Path, 
         said = rf"tandem {part}: {file}: the last \d+ bytes are of a torn write and are cut off"
         assert re.search(said, end.err, re.MULTILINE), ended
     assert f", resumed at tick {tick}: waiting for a, b" in ended["world"].out
-    same(out, undisturbed)
+    assert decided(out) == decided(undisturbed)
 
 
 def test_a_world_and_an_agent_that_are_killed_go_on_by_the_same_commands(
@@ -338,7 +326,7 @@ def test_a_world_and_an_agent_that_are_killed_go_on_by_the_same_commands(
         second.until_prints("waiting for a, b")
         last = folder.enter_context(TandemProcess(*b))
         assert [part.ended().status for part in (second, agent, last)] == [0, 0, 0]
-    same(tmp_path, undisturbed)
+    assert decided(tmp_path) == decided(undisturbed)
 
 
 def test_a_process_that_has_ended_prints_its_outcome_again(undisturbed: Path, tmp_path: Path) -> None:
@@ -351,7 +339,7 @@ def test_a_process_that_has_ended_prints_its_outcome_again(undisturbed: Path, tm
     assert agent == (0, "a: localised after 48 ticks\n", "")
     clock = tandem("world", "paper-1", "--listen", endpoint, "--out", out, "-q")
     assert clock == (0, LOCALISED, "")
-    same(out, undisturbed)
+    assert decided(out) == decided(undisturbed)
 
 
 def test_a_world_killed_after_its_mission_end_collects_the_final_reports(
@@ -366,7 +354,7 @@ def test_a_world_killed_after_its_mission_end_collects_the_final_reports(
     with ExitStack() as folder:
         ended = {name: shell.ended() for name, shell in shells(tmp_path, free_endpoint(), folder).items()}
     assert {name: end.status for name, end in ended.items()} == {"world": 0, "a": 0, "b": 0}, ended
-    same(tmp_path, undisturbed)
+    assert decided(tmp_path) == decided(undisturbed)
 
 
 def test_an_agent_repeats_its_final_report_until_a_world_has_recorded_it(tmp_path: Path) -> None:

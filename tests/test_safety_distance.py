@@ -1,4 +1,4 @@
-"""Two robots that range each other keep the safety distance under every remaining hypothesis."""
+"""Robots of pairs and groups keep the safety distance under every remaining hypothesis."""
 
 from __future__ import annotations
 
@@ -12,13 +12,19 @@ from hypothesis import strategies as st
 from msgspec.structs import replace
 
 from agent.planning import separation
+from agent.planning.state import Bypass
+from agent.planning.travelling import BLOCKED_AFTER, MOST_YIELDED, RESERVE, aside, leeway, limited, passed
 from compose.audit.claim_rules import distance
+from compose.audit.rules import audit_run
 from compose.launch.in_process import run_mission
 from compose.recording.closest_approach import nearest
+from compose.recording.run import of_frames
 from compose.scenario.scenario_file import load, validate
+from protocol.mission import Mission
 from protocol.motion import Controls, Pose, step
 from tests.commands import tandem
-from tests.missions import outcome
+from tests.groups import localised, table_of
+from tests.missions import kept, outcome
 from tests.series import series
 from world.scenario import Scenario
 
@@ -153,3 +159,162 @@ def test_a_safety_distance_above_that_at_first_contact_is_refused(tmp_path: Path
         f"tandem run: {file}: mission.safety_distance: 1.01 m, but robots that approach each other at "
         "max_speed may be 1 m apart at their first contact (sensing_range - 2 max_speed period)\n"
     )
+
+
+MISSION = Mission(3.0, 1.0, 1.0, math.pi, safety_distance=0.5)
+
+
+def group_apart(robots: int, seed: int, distance: float, sigma: float = 0.0) -> Scenario:
+    """Return a group with a safety distance."""
+    table = table_of(robots, seed, sigma=sigma)
+    table["mission"]["safety_distance"] = distance
+    return validate(table, "group.toml").scenario
+
+
+# --- one tick -----------------------------------------------------------------------------------------
+
+
+@given(st.floats(0.5, 3.0), st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi))
+def test_two_robots_that_drive_their_leeway_keep_the_distance(
+    rho: float, bearing: float, other: float
+) -> None:
+    free = leeway({"b": rho}, MISSION)
+    x = rho + free * (math.cos(other) - math.cos(bearing))
+    y = free * (math.sin(other) - math.sin(bearing))
+    assert math.hypot(x, y) >= MISSION.safety_distance - 1e-12
+
+
+def test_robots_out_of_range_limit_nothing() -> None:
+    assert leeway({}, MISSION) == math.inf
+    assert leeway({"c": 2.5}, MISSION) == pytest.approx(1.0)
+    assert leeway({"b": 0.6, "c": 2.5}, MISSION) == pytest.approx(0.05)
+
+
+def test_a_robot_stands_still_where_a_range_is_missing() -> None:
+    assert leeway({"c": None, "d": 2.5}, MISSION) == 0.0
+
+
+def test_the_way_aside_leads_back_to_one_side_and_past() -> None:
+    back, beside, past = aside(Pose(0.0, 0.0, 0.0), MISSION, 1.0)
+    assert back[0] == beside[0] < -MISSION.safety_distance
+    assert back[1] == 0.0
+    assert beside[1] == past[1] > 2.0 * MISSION.safety_distance
+    assert past[0] > 2.0 * MISSION.safety_distance
+    assert aside(Pose(0.0, 0.0, 0.0), MISSION, -1.0)[1][1] == -beside[1]
+
+
+LITTLE = 2.0**-7
+"""A way (m) so short that a robot is blocked."""
+
+
+def ticked(passing: Bypass, free: float, v: float = 1.0, *, waits: bool = False) -> Bypass:
+    rho = MISSION.safety_distance + 2.0 * free
+    before = ["b"] if waits else []
+    return passed(passing, {"b": rho}, before, Pose(0.0, 0.0, 0.0), Controls(v, 0.0), MISSION)
+
+
+def test_a_robot_is_blocked_while_little_way_is_left_that_does_not_grow() -> None:
+    passing = Bypass()
+    for ticks in range(BLOCKED_AFTER - 1):
+        assert passing.blocked == ticks
+        passing = ticked(passing, LITTLE)
+    assert ticked(passing, 2.0 * LITTLE).blocked == BLOCKED_AFTER - 1
+    assert ticked(passing, 0.5).blocked == 0
+    assert ticked(passing, LITTLE).places[0][0] < 0.0
+    assert ticked(passing, LITTLE, -1.0).places[0][0] > 0.0
+    assert ticked(passing, LITTLE, 0.0).places == ()
+
+
+def test_one_that_waits_for_another_one_drives_aside_after_it() -> None:
+    passing = Bypass(leeway=LITTLE, blocked=BLOCKED_AFTER - 1)
+    for _ in range(MOST_YIELDED):
+        passing = ticked(passing, LITTLE, waits=True)
+        assert (passing.leeway, passing.places) == (0.0, ())
+    assert ticked(passing, LITTLE, waits=True).places
+
+
+def test_robots_keep_a_reserve_but_on_a_aside() -> None:
+    ahead, least = Controls(1.0, 0.0), RESERVE * MISSION.first_straight
+    assert limited(ahead, Bypass(leeway=least), MISSION).v == 0.0
+    assert limited(ahead, Bypass(leeway=least, places=((1.0, 0.0),)), MISSION).v == least
+    assert limited(ahead, Bypass(), MISSION) == ahead
+
+
+# --- missions -----------------------------------------------------------------------------------------
+
+CASES = [(4, 20, 1.0), (8, 28, 0.5), (4, 10, 1.0), (8, 34, 0.5), (8, 39, 0.5), (4, 43, 1.0), (16, 1, 0.5)]
+"""Groups in which robots blocked each other before visited robots let their visitors leave, before blocked
+ones drove aside, or before one of two yielded."""
+
+
+@pytest.mark.parametrize("case", series(CASES, 2))
+def test_all_robots_keep_the_distance_and_are_localised_within_the_bound(
+    case: tuple[int, int, float],
+) -> None:
+    scenario = group_apart(*case)
+    run = run_mission(scenario)
+    assert localised(run) == set(run.robots)
+    least = nearest(run)
+    assert least is not None
+    assert least >= case[2] - 1e-9
+    assert run.end is not None
+    assert run.end.tick * scenario.mission.period <= scenario.meetings[-1].ends
+
+
+BLOCKED = {
+    "on an orbit, by one that waits": (76739130, 4, 30.0, {"sensing_range": 2.1, "period": 0.77}),
+    "in phase 1, by one that drives towards it": (82, 6, 15.0, {}),
+}
+"""Groups in which two robots stopped for each other for ever: seed, robots, spacing and mission."""
+
+
+@pytest.mark.parametrize("name", BLOCKED)
+def test_robots_that_block_each_other_make_way(name: str) -> None:
+    seed, robots, spacing, mission = BLOCKED[name]
+    table = {
+        "name": "blocked",
+        "seed": seed,
+        "mission": {
+            "sensing_range": 3.0,
+            "period": 1.0,
+            "max_speed": 1.0,
+            "max_turn_rate": 3.455751918948773,
+            "safety_distance": 0.3,
+            **mission,
+        },
+        "group": {"robots": robots, "spacing": spacing},
+    }
+    run = of_frames(kept(validate(table, "blocked.toml").scenario))
+    assert localised(run) == set(run.robots)
+    assert audit_run(run).violations == ()
+    least = nearest(run)
+    assert least is not None
+    assert least >= 0.3 - 1e-9
+
+
+def test_no_robot_has_to_keep_the_distance_to_a_dead_one_which_it_cannot_range() -> None:
+    """Two robots begin 0.45 m apart; after the death of r2, r1 passes it at 0.01 m."""
+    table = table_of(5, 0)
+    table["mission"] |= {"period": 0.77, "safety_distance": 0.75}
+    table |= {"seed": 1518866833, "group": {"robots": 5, "spacing": 6.0, "dies": 54}}
+    del table["robot"]
+    run = of_frames(kept(validate(table, "dead.toml").seeded(None)))
+    least = nearest(run)
+    assert least is not None
+    assert least >= 0.45
+    assert audit_run(run).violations == ()
+
+
+@pytest.mark.long
+def test_the_audit_of_a_group_with_a_safety_distance_is_clean() -> None:
+    found = audit_run(of_frames(kept(group_apart(4, 10, 1.0))))
+    assert found.violations == ()
+
+
+@pytest.mark.long
+def test_robots_with_noisy_ranges_keep_the_distance() -> None:
+    run = run_mission(group_apart(4, 3, 0.5, sigma=0.05))
+    assert localised(run) == set(run.robots)
+    least = nearest(run)
+    assert least is not None
+    assert least >= 0.5

@@ -1,7 +1,8 @@
-"""Teams in viewers, exports and figures: anchors by name, ranges to several, poses and claims."""
+"""What is made of the runs of teams: audits, exports, figures, the page, anchors by name, claims."""
 
 from __future__ import annotations
 
+import json
 import re
 from pathlib import Path
 
@@ -9,17 +10,31 @@ import msgspec
 import pytest
 from msgspec.structs import replace
 
+import tandem
+from agent.estimation.judged import MUTUAL_RANGES
+from compose.audit.rules import audit_run
 from compose.launch import in_process
-from compose.recording.run import Run, read
+from compose.launch.in_process import run_mission
+from compose.recording.ranging.run_ranges import ranges_of_run
+from compose.recording.run import Run, of_frames, read
 from compose.scenario import scenario_file
-from compose.scenario.scenario_change import RobotChange, changed, values_of
+from compose.scenario.scenario_change import RobotChange, changed, file_table, values_of
+from compose.scenario.scenario_file import load
+from compose.sweep.trial import Trial, row
 from compose.view.drawing import DARK, GREY, drawing, standing
 from compose.view.numbers import Numbers
 from compose.view.recorded import run_data, scenes
 from compose.view.scene import HeldPoses, Scene
-from protocol.motion import ORIGIN
-from tests.browser import Open, shot, until_shown, watching
-from tests.commands import tandem
+from protocol.messages import Localised, NamedRange, Observation
+from protocol.motion import ORIGIN, Controls
+from protocol.wire import decode
+from tests.browser import Open, shot, watching
+from tests.commands import copied
+from tests.commands import tandem as command
+from tests.missions import kept
+from tests.test_team import ALONE, DRAWN, MISSION, drawn, team
+from world.hardware.driver import Reading
+from world.hardware.measurements import InvalidReading, observation_frame
 
 SURVEY = """
 name = "survey"
@@ -191,14 +206,11 @@ def test_a_team_is_run_again_from_other_starts(survey: Path) -> None:
 def test_tandem_figures_draws_a_team_and_says_in_one_line_what_is_not_of_teams(
     survey: Path, tmp_path: Path
 ) -> None:
-    copy = tmp_path / "recording"
-    copy.mkdir()
-    for path in survey.glob("*.journal"):
-        (copy / path.name).write_bytes(path.read_bytes())
-    drawn = tandem("figures", str(copy), "--format", "svg")
-    assert drawn.status == 0, drawn.err
+    copy = copied(survey, tmp_path / "recording")
+    done = command("figures", str(copy), "--format", "svg")
+    assert done.status == 0, done.err
     assert {path.name for path in (copy / "figures").iterdir()} == {"trajectory.svg", "errors.svg"}
-    assert drawn.err == (
+    assert done.err == (
         "tandem figures: no meetings, phases, geometry, phase-1, plan, encounter, ranges, robot: "
         "the robots of a team share all measurements, and form no pairs\n"
     )
@@ -221,8 +233,7 @@ def test_the_page_names_anchors_and_shows_unknown_ones_with_the_truth_only(
     opened: Open, survey: Path
 ) -> None:
     with watching(survey) as (_, where):
-        page = opened(f"{where}#tick=0")
-        until_shown(page, 0)
+        page = opened(where, tick=0)
         shot(page, "team")
         assert page.evaluate(ANCHORS) == ["A1", "A2", "A3", "A4"]
         assert {"A1", "A3"} <= {*page.evaluate(LABELS)}
@@ -237,3 +248,86 @@ def test_the_page_names_anchors_and_shows_unknown_ones_with_the_truth_only(
         legend = page.locator("#legend").inner_text()
         assert "where a robot has located an anchor" in legend
         assert "path, located" in legend
+
+
+# --- what is made of a run -----------------------------------------------------------------------------
+
+
+def test_a_claim_with_fewer_ranges_than_determine_a_pose_is_a_violation() -> None:
+    run = run_mission(team(ALONE))
+    recorded = of_frames(kept(run.scenario))
+    agent = recorded.agents["a"]
+    bare = [replace(one, observation=replace(one.observation, anchors=())) for one in agent.steps]
+    spoilt_run = replace(recorded, agents={"a": replace(agent, steps=tuple(bare))})
+    found = [one.what for one in audit_run(spoilt_run).violations if one.rule == "claim"]
+    assert any("ranges that determine a pose" in one for one in found)
+
+
+def test_an_exact_team_without_anchors_claims_by_fewer_ranges_without_a_violation() -> None:
+    mission = MISSION.replace("0.05", "0.0").replace("0.1", "0.2")
+    mission += 'frame = "relative"\narea = [0.0, 0.0, 10.0, 10.0]\n'
+    run = of_frames(kept(drawn(3, 2837363329321034163, mission)))
+    first, *_ = [k for k, tick in enumerate(run.ticks) if tick.commands["r1"].verdict is not None]
+    assert 2 * (first + 1) < MUTUAL_RANGES
+    assert audit_run(run).violations == ()
+
+
+def test_a_run_of_a_team_is_a_range_recording_with_its_anchors_by_name() -> None:
+    run = run_mission(team("", DRAWN + "unknown = 1"))
+    recording = ranges_of_run(run)
+    assert [one.id for one in recording.anchors] == ["A1", "A2", "A3"]
+    assert [one.sigma for one in recording.anchors] == [0.0, 0.0, float("inf")]
+    assert len(recording.ranges.t) == sum(
+        len(seen[robot].anchors) for seen in run.observations[: run.length] for robot in seen
+    ) + sum(bool(seen["r1"].contacts) for seen in run.observations[: run.length])
+
+
+def test_a_trial_of_a_team_has_no_columns_of_pairs() -> None:
+    scenario = load("room")
+    found = row(Trial(0, 0, scenario, processes=False), run_mission(scenario), 1.0)
+    assert (found.outcome, found.claims, found.claims_within) == ("localised", 2, 2)
+    assert (found.meeting_tick, found.orbiting_tick, found.robots["a"].bound_m) == (None,) * 3
+    assert found.t_max_s == scenario.t_max
+    columns = found.group
+    assert columns is not None
+    assert (columns.bound_ticks, columns.honest_localised) == (round(scenario.t_max), 2)
+    assert (columns.honest_undecided, columns.honest_wrong, columns.attacker_met) == (0, 0, None)
+
+
+def test_the_python_api_has_the_ranges_to_all_anchors() -> None:
+    world = tandem.World(file_table(team(ALONE)))
+    seen = world.observe()["a"]
+    assert [one.anchor for one in seen.anchors] == ["A1", "A2", "A3"]
+    assert seen.anchor_range is None
+    assert seen.nearest_anchor_range == min(one.range for one in seen.anchors)
+    result = tandem.run("room")
+    assert result.outcome == "localised"
+
+
+def test_a_driver_reports_the_ranges_to_the_anchors_of_a_team() -> None:
+    config = team(ALONE + '\nanchors = ["A1", "A3"]').config("a")
+    reading = Reading(Controls(0.0, 0.0), anchors={"A3": 2.0, "A1": None})
+    assert decode(observation_frame(reading, 1, config), Observation).anchors == (NamedRange("A3", 2.0),)
+    for wrong, why in (
+        (replace(reading, anchors={"A2": 1.0}), "'A2' is none that a may range"),
+        (replace(reading, anchors=3), "anchors is a int"),
+        (replace(reading, mutual_range=1.0), "robots of a team have no peer"),
+        (replace(reading, anchors={"A1": -1.0}), "Expected `float` >= 0.0"),
+    ):
+        with pytest.raises(InvalidReading, match=why):
+            observation_frame(wrong, 1, config)
+
+
+def test_a_recorded_team_is_audited_and_exported(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    shown = command("run", "relative", "--in-process", "--out", out)
+    assert shown.status == 0, shown
+    assert "ranges to anchors + to other robots" in " ".join(shown.out.split())
+    assert command("audit", out).status == 0
+    summed = json.loads((out / "summary.json").read_text())
+    assert summed["t_max_s"] > 0.0
+    assert {robot["localised"] for robot in summed["robots"].values()} == {True}
+    run = read(out)
+    assert all(isinstance(one, Localised) for one in run.verdicts().values())
+    assert "poses are in the frame of that of a" in command("estimate", out).out
+    assert "b has ranges to no anchor" in command("estimate", out, "--robots", "b,c").err

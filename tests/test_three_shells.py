@@ -20,7 +20,18 @@ from protocol.network import keys, session
 from protocol.network.endpoints import at, listening
 from protocol.network.inbox import Inbox
 from protocol.wire import encode
-from tests.commands import BOUND_S, TandemProcess, journals, processes_of, several_pairs, tandem, until, world
+from tests.commands import (
+    BOUND_S,
+    TandemProcess,
+    decided,
+    in_one_process,
+    journals,
+    processes_of,
+    several_pairs,
+    tandem,
+    until,
+    world,
+)
 from tests.series import series
 
 NOBODY = "nothing listens there; check the address, and that the router runs"
@@ -28,14 +39,6 @@ NOBODY = "nothing listens there; check the address, and that the router runs"
 
 def unanswered() -> None:
     raise AssertionError("nothing listens there")
-
-
-@pytest.fixture(scope="module")
-def paper_1(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the recording of the first simulation of the paper."""
-    out = tmp_path_factory.mktemp("paper-1") / "out"
-    assert tandem("run", "paper-1", "--in-process", "-q", "--out", out).status == 0
-    return out
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="a reserved port could not be listened on elsewhere")
@@ -57,7 +60,7 @@ ORDERS = [("world", "a", "b"), ("world", "b", "a"), ("a", "world", "b"), ("b", "
 
 @pytest.mark.parametrize("order", series(ORDERS), ids="-".join)
 def test_any_order_of_starting_gives_the_same_recording(
-    order: tuple[str, ...], paper_1: Path, tmp_path: Path
+    order: tuple[str, ...], undisturbed: Path, tmp_path: Path
 ) -> None:
     endpoint, out = free_endpoint(), tmp_path / "out"
     with ExitStack() as shells:
@@ -80,20 +83,19 @@ def test_any_order_of_starting_gives_the_same_recording(
     for name in ("a", "b"):
         assert f"{name}: localised after 48 ticks" in ended[name].out
     assert "localised after 48 ticks" in ended["world"].out
-    assert journals(out) == journals(paper_1)
-    assert (out / "ticks.csv").read_bytes() == (paper_1 / "ticks.csv").read_bytes()
+    assert decided(out) == decided(undisturbed)
     assert not processes_of(endpoint)
 
 
 @pytest.mark.long
-def test_each_shell_may_write_its_journal_to_its_own_folder(paper_1: Path, tmp_path: Path) -> None:
+def test_each_shell_may_write_its_journal_to_its_own_folder(undisturbed: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path / "world") as (clock, endpoint), ExitStack() as shells:
         for robot in ("a", "b"):
             agent = TandemProcess("agent", robot, "--connect", endpoint, "--out", tmp_path / robot)
             shells.enter_context(agent)
         assert clock.ended().status == 0
     found = {name: data for part in ("world", "a", "b") for name, data in journals(tmp_path / part).items()}
-    assert found == journals(paper_1)
+    assert found == journals(undisturbed)
 
 
 @pytest.mark.parametrize("pairs", series([2, 3], 0))
@@ -108,8 +110,7 @@ def test_several_pairs_localise_side_by_side_in_one_world(pairs: int, tmp_path: 
         ]
         assert clock.ended().status == 0
         assert [agent.ended().status for agent in agents] == [0] * len(agents)
-    again = tmp_path / "again"
-    assert tandem("run", scenario, "--in-process", "-q", "--out", again).status == 0
+    again = in_one_process(scenario, tmp_path / "again")
     assert sorted(journals(out)) == sorted([*(f"agent-{robot}.journal" for robot in robots), "world.journal"])
     assert journals(out) == journals(again)
 
@@ -237,7 +238,7 @@ def test_an_agent_that_was_not_ready_in_time_is_refused_if_another_is_the_robot(
 
 @pytest.mark.long
 def test_of_two_agents_that_start_at_once_one_is_refused_and_the_mission_is_not_disturbed(
-    paper_1: Path, tmp_path: Path
+    undisturbed: Path, tmp_path: Path
 ) -> None:
     patient = ("--timeout", "100", "--out", tmp_path)
     with world("paper-1", "--run", "mine", *patient) as (clock, endpoint), ExitStack() as open_ones:
@@ -249,7 +250,7 @@ def test_of_two_agents_that_start_at_once_one_is_refused_and_the_mission_is_not_
         refused, localised = sorted([one.ended() for one in twice], key=lambda ended: -ended.status)
     assert refused == (2, "", "tandem agent: robot 'a' is in run 'mine' already: another process is a\n")
     assert localised == (0, "a: in run mine, with b\na: localised after 48 ticks\n", "")
-    assert (tmp_path / "world.journal").read_bytes() == (paper_1 / "world.journal").read_bytes()
+    assert (tmp_path / "world.journal").read_bytes() == (undisturbed / "world.journal").read_bytes()
 
 
 @pytest.mark.long
@@ -277,7 +278,7 @@ def test_a_second_agent_that_waits_when_the_world_ends_is_refused() -> None:
 
 
 @pytest.mark.long
-def test_an_agent_that_is_refused_does_not_disturb_the_mission(paper_1: Path, tmp_path: Path) -> None:
+def test_an_agent_that_is_refused_does_not_disturb_the_mission(undisturbed: Path, tmp_path: Path) -> None:
     with world("paper-1", "--out", tmp_path) as (clock, endpoint):
         with TandemProcess("agent", "a", "--connect", endpoint, "--out", tmp_path) as a:
             a.until_answered("a", tmp_path)
@@ -285,7 +286,7 @@ def test_an_agent_that_is_refused_does_not_disturb_the_mission(paper_1: Path, tm
                 assert tandem("agent", refused, "--connect", endpoint).status == 2
             assert tandem("agent", "b", "--connect", endpoint, "--out", tmp_path).status == 0
         assert clock.ended().status == 0
-    assert journals(tmp_path) == journals(paper_1)
+    assert journals(tmp_path) == journals(undisturbed)
 
 
 @pytest.mark.parametrize(

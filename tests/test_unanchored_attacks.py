@@ -20,12 +20,13 @@ from compose.launch.in_process import run_mission
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run, of_frames
 from compose.scenario.scenario_change import file_table
-from compose.scenario.scenario_file import ScenarioTemplate, validate
+from compose.scenario.scenario_file import ScenarioTemplate
 from compose.sweep import spec
 from compose.sweep.cells import cells, setting_of
 from protocol.messages import Contact, Localised, Observation, Report, ReportedPose, Undecided
 from protocol.motion import ORIGIN, REST, Controls, Pose, Segment, compose, step, wrap
 from protocol.rounding import TOLERANCE
+from tests.groups import with_value
 from tests.missions import kept
 from tests.test_group_runs import audited
 from tests.test_unanchored import four, last_claim, scenario_of, table_with
@@ -129,6 +130,12 @@ def test_no_shipped_attack_leads_to_a_wrong_claim() -> None:
 
 SLIGHTLY_LONGER = {"kind": "shift", "part": "all", "size": 1e-6}
 SLIGHTLY_FARTHER = {"kind": "radius", "size": 1e-6}
+FIRST_FOUND = [
+    *((2.7, 1.1), (7.4, 15.3), (0.4, 10.3), (20.7, 19.7), (4.7, 19.6), (14.7, 4.1), (11.3, 17.0), (4.0, 21.1))
+]
+VISITED = [
+    *((8.3, 1.0), (10.2, 7.0), (2.7, 6.3), (12.0, 11.1), (5.1, 9.4), (1.9, 1.6), (8.8, 0.6), (11.5, 2.2))
+]
 
 
 @pytest.mark.parametrize(
@@ -136,16 +143,7 @@ SLIGHTLY_FARTHER = {"kind": "radius", "size": 1e-6}
     [
         pytest.param(
             480005,
-            [
-                (2.7, 1.1),
-                (7.4, 15.3),
-                (0.4, 10.3),
-                (20.7, 19.7),
-                (4.7, 19.6),
-                (14.7, 4.1),
-                (11.3, 17.0),
-                (4.0, 21.1),
-            ],
+            FIRST_FOUND,
             {6: SLIGHTLY_LONGER, 7: SLIGHTLY_FARTHER},
             1,
             id="an attacker is found while it is in phase 1",
@@ -159,16 +157,7 @@ SLIGHTLY_FARTHER = {"kind": "radius", "size": 1e-6}
         ),
         pytest.param(
             107945,
-            [
-                (8.3, 1.0),
-                (10.2, 7.0),
-                (2.7, 6.3),
-                (12.0, 11.1),
-                (5.1, 9.4),
-                (1.9, 1.6),
-                (8.8, 0.6),
-                (11.5, 2.2),
-            ],
+            VISITED,
             {4: {"kind": "heading", "size": 1e-6}, 6: SLIGHTLY_FARTHER},
             1,
             id="an attacker that has been found stays beside a robot that others visit",
@@ -332,43 +321,28 @@ def test_a_changed_scenario_keeps_the_number_of_false_reporters() -> None:
     assert scenario_of(file_table(scenario)) == scenario
 
 
-@pytest.mark.parametrize(
-    ("change", "message"),
-    [
-        (
-            lambda table: table["mission"].pop("tolerates"),
-            r"robot\[0\].attack: .* believes the poses that others report: set mission.tolerates = 1",
-        ),
-        (
-            lambda table: table["robot"][4].update(attack=REFRAME),
-            r"robot\[0\].attack: .*: set mission.tolerates = 2",
-        ),
-        (
-            lambda table: table["mission"].update(tolerates=2),
-            r"mission.tolerates: to tolerate 2, 5 robots need an anchor, of which 3 are then honest; there",
-        ),
-        (
-            lambda table: table["mission"].update(noise={"anchor_sigma": 0.05, "mutual_sigma": 0.05}),
-            r"mission.tolerates: with noisy sensors, all robots need an anchor",
-        ),
-        (
-            lambda table: (
-                [robot.setdefault("anchor", [20.0, 5.0 * len(robot)]) for robot in table["robot"][:4]]
-                and table["robot"].pop()
-            ),
-            r"mission.tolerates: sensors are exact and all robots have an anchor, so they check all reports",
-        ),
-    ],
-)
-def test_attackers_that_are_not_tolerated_are_refused_in_one_line(change: Any, message: str) -> None:
-    table = five("a")
-    change(table)
+ANCHORED = [{"id": robot, "anchor": [20.0, 5.0 * place]} for place, robot in enumerate("abcd")]
+REFUSED: dict[str, tuple[str, Any]] = {
+    r"robot\[0\].attack: .* believes the poses that others report: set mission.tolerates = 1": (
+        "mission.tolerates",
+        None,
+    ),
+    r"robot\[0\].attack: .*: set mission.tolerates = 2": ("robot.4.attack", REFRAME),
+    r"mission.tolerates: to tolerate 2, 5 robots need an anchor, of which 3 are then honest; there": (
+        "mission.tolerates",
+        2,
+    ),
+    r"mission.tolerates: with noisy sensors, all robots need an anchor": (
+        "mission.noise",
+        {"anchor_sigma": 0.05, "mutual_sigma": 0.05},
+    ),
+    r"mission.tolerates: sensors are exact and all robots have an anchor, so they": ("robot", ANCHORED),
+    r"mission.tolerates: it is for groups": ("robot", ANCHORED[:2]),
+}
+"""Values that are refused, and the place of each in the file, by the reason."""
+
+
+@pytest.mark.parametrize("message", REFUSED)
+def test_attackers_that_are_not_tolerated_are_refused_in_one_line(message: str) -> None:
     with pytest.raises(UserError, match=f"^group.toml: {message}"):
-        scenario_of(table)
-
-
-def test_a_pair_tolerates_no_attacker() -> None:
-    table = five()
-    table["robot"] = table["robot"][:2]
-    with pytest.raises(UserError, match=r"mission\.tolerates: it is for groups"):
-        validate(table, "group.toml")
+        scenario_of(with_value(five("a"), *REFUSED[message]))

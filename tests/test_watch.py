@@ -63,8 +63,7 @@ WITH_TIMEOUT = ("--timeout", "600")
 
 
 def test_a_recording_at_tick_46_shows_the_first_contact(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=45")
-    until_shown(page, 45)
+    page = opened(address, tick=45)
     expect(page.locator(".card[data-robot=a] dd").first).not_to_contain_text("b")
     box = page.locator("#line").bounding_box()
     assert box is not None
@@ -134,16 +133,14 @@ def test_the_deliveries_of_reports_are_drawn_between_the_robots(opened: Open, tm
         recording.mkdir()
         in_process.run_mission(load("paper-1", faults=[f"{fault}, contact_ticks=0..1"]), recording)
         with watching(recording) as (_, where):
-            page = opened(f"{where}#tick=46")
-            until_shown(page, 46)
+            page = opened(where, tick=46)
             seen[fault] = inks(page)["fault"]
     assert seen["loss=0"] == 0 < 1.7 * seen["loss=1"] < seen["corrupt=1"]  # dashed; solid and crossed out
 
 
 @pytest.mark.long
 def test_with_the_truth_hidden_the_page_shows_only_estimates(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=20")
-    until_shown(page, 20)
+    page = opened(address, tick=20)
     plane, truth = page.locator("#canvas"), picture(page)
     expect(plane).to_have_attribute("aria-label", re.compile(r"a at 2\.66, 5\.93 m"))
     page.locator("#truth").uncheck()
@@ -166,8 +163,7 @@ def test_with_the_truth_hidden_the_page_shows_only_estimates(opened: Open, addre
 
 @pytest.mark.long
 def test_the_page_can_be_used_by_keyboard_alone(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=0")
-    until_shown(page, 0)
+    page = opened(address, tick=0)
     press = page.keyboard.press
     for key, tick in (
         ("ArrowRight", 1),
@@ -221,8 +217,7 @@ def test_robots_in_hardware_mode_are_shown_by_their_estimates(
         frames = [encode(as_a_driver_tells(one)) for one in told]
         (tmp_path / path.name).write_bytes(b"".join([msgpack.packb(frame) for frame in frames]))
     with watching(tmp_path) as (_, where):
-        page = opened(f"{where}#tick=46")
-        until_shown(page, 46)
+        page = opened(where, tick=46)
         expect(page.locator(".card[data-robot=b] .doing")).to_contain_text("b stands still")
         expect(page.locator("#seen")).to_contain_text("no ground truth")
         expect(page.locator("#log")).to_contain_text("b claims to be at")
@@ -238,8 +233,7 @@ def as_a_driver_tells(message: Message) -> Message:
 
 @pytest.mark.long
 def test_the_page_is_legible_at_360_pixels(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=48", width=360, height=740)
-    until_shown(page, 48)
+    page = opened(address, tick=48, width=360, height=740)
     assert page.evaluate("document.documentElement.scrollWidth") <= 360
     for part in ("#canvas", "#play", "#back", "#on", "#truth", "#robot", "#line"):
         expect(page.locator(part)).to_be_in_viewport()
@@ -251,8 +245,7 @@ def test_the_page_is_legible_at_360_pixels(opened: Open, address: str) -> None:
 @chromium_only
 @pytest.mark.long
 def test_the_page_is_dark_if_the_system_is(opened: Open, address: str) -> None:
-    page = opened(f"{address}#tick=47", dark=True)
-    until_shown(page, 47)
+    page = opened(address, tick=47, dark=True)
     shot(page, "dark")
     background = page.evaluate("getComputedStyle(document.documentElement).backgroundColor")
     assert max(map(int, re.findall(r"\d+", background)[:3])) < 64
@@ -275,8 +268,7 @@ def test_fifty_robots_are_shown(opened: Open, tmp_path: Path) -> None:
     recording.mkdir()
     in_process.run_mission(load(str(scenario)), recording)
     with watching(recording) as (_, where):
-        page = opened(f"{where}#tick=20")
-        until_shown(page, 20)
+        page = opened(where, tick=20)
         expect(page.locator(".entry")).to_have_count(50)
         expect(page.locator(".card .name")).to_have_text(["a0", "b0"])
         shot(page, "fifty")
@@ -294,16 +286,14 @@ def test_lost_late_and_damaged_reports_are_shown(opened: Open, tmp_path: Path) -
         load("noisy", faults=["loss=0.3, delay=0..3, corrupt=0.1, duplicate=0.2"]), recording
     )
     with watching(recording) as (_, where):
-        page = opened(f"{where}#tick=26")
-        until_shown(page, 26)
+        page = opened(where, tick=26)
         expect(page.locator("#log")).to_contain_text("is lost")
         expect(page.locator("#log")).to_contain_text("ticks late")
         page.keyboard.press("n")
         shot(page, "faults")
         page.locator("#radio").uncheck()
         expect(page.locator("#log")).not_to_contain_text("is lost")
-        page = opened(f"{where}#tick=55")
-        until_shown(page, 55)
+        page = opened(where, tick=55)
         expect(page.locator(".probability li").first).to_contain_text("%")
 
 

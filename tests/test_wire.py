@@ -1,9 +1,11 @@
-"""A frame is decoded completely, or refused with MalformedFrame."""
+"""A frame is decoded completely, or refused with MalformedFrame, also by several threads at first."""
 
 from __future__ import annotations
 
 import math
 import struct
+import subprocess
+import sys
 import zlib
 from collections.abc import Iterator
 from functools import reduce
@@ -371,3 +373,47 @@ def test_the_reports_of_a_pair_are_at_most_a_tenth_larger_than_in_version_2() ->
 def test_a_cause_without_what_its_text_needs_is_refused(cause: list[object]) -> None:
     """The viewers make the text of causes that anyone may have sent."""
     refuses(framed(packed(["mission-end", 48, "failed", [cause]])))
+
+
+# --- several threads: by itself, msgspec crashes the process if several first decode a type ---------------
+
+AT_ONCE = """
+import sys, threading
+sys.setswitchinterval(1e-7)
+begin, ended = threading.Barrier(4), []
+
+def first():
+    begin.wait()
+    decode_all()
+    ended.append(True)
+
+threads = [threading.Thread(target=first) for _ in range(4)]
+for one in threads:
+    one.start()
+for one in threads:
+    one.join()
+print(len(ended))
+"""
+FRAMES = """
+from protocol.wire import decode, encode
+from tests.examples import EXAMPLES
+
+frames = [(encode(one), type(one)) for one in EXAMPLES]
+
+def decode_all():
+    for frame, kind in frames:
+        decode(frame, kind)
+"""
+
+
+def of_four_threads(code: str) -> tuple[int, str]:
+    """Return the exit status of a new process, and how many of its threads could run `decode_all`."""
+    ended = subprocess.run(
+        [sys.executable, "-c", code + AT_ONCE], stdout=subprocess.PIPE, check=False, timeout=60.0
+    )
+    return ended.returncode, ended.stdout.decode().strip()
+
+
+def test_several_threads_can_be_the_first_that_decode_messages() -> None:
+    for _ in range(3):
+        assert of_four_threads(FRAMES) == (0, "4")

@@ -18,13 +18,7 @@ from protocol.journal.journal_file import MemoryJournal
 from tests.commands import tandem as command
 from tests.own_models import Late
 from tests.series import series
-from world.radio_models import (
-    ByteRateRadio,
-    CollidingRadio,
-    FadingRadio,
-    LogDistanceRadio,
-    WalledRadio,
-)
+from world.radio_models import ByteRateRadio, CollidingRadio, FadingRadio, LogDistanceRadio, WalledRadio
 from world.range_models import AttackedRange, FadingRange, WalledRange
 from world.scenario import Scenario
 from world.world_models import RadioModel, Radios, RangeModel, Transmission

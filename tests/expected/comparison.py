@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import msgspec
 import numpy as np
@@ -65,6 +65,14 @@ class Count(msgspec.Struct, frozen=True):
     of_new: int
     old: int
     of_old: int
+
+
+class Place(NamedTuple):
+    """Of what a statistic is."""
+
+    level: Level
+    sweep: str
+    where: str
 
 
 class Test(msgspec.Struct, frozen=True):
@@ -126,43 +134,40 @@ def compare(runs: Sequence[Run]) -> list[Test]:
     for run in runs:
         for i in range(len(run.old.cell)):
             tests += _of_cell(run, i)
-        tests += _together("all cells", run.old.sweep, [run])
-    return tests + (_together("all files", "all files", runs) if len(runs) > 1 else [])
+        tests += _together(Place("all cells", run.old.sweep, "all cells"), [run])
+    every = Place("all files", "all files", "all cells")
+    return tests + (_together(every, runs) if len(runs) > 1 else [])
 
 
-def _together(level: Level, sweep: str, runs: Sequence[Run]) -> list[Test]:
+def _together(place: Place, runs: Sequence[Run]) -> list[Test]:
     """Return the tests of what is pooled over all cells of `runs`, and of trials with equal seeds."""
-    return [*_pooled(level, sweep, runs), *_paired(level, sweep, runs)]
+    return [*_pooled(place, runs), *_paired(place, runs)]
 
 
 def _of_cell(run: Run, i: int) -> list[Test]:
     new, old = run.new.cell[i], run.old.cell[i]
-    place: tuple[Level, str, str] = ("cell", run.old.sweep, old.label)
+    place = Place("cell", run.old.sweep, old.label)
     values = run.trials.where(run.trials.cell == i).values
     found = [
-        count_test(*place, name, [count]) for name, count in counts(new, old).items() if count.new + count.old
+        count_test(place, name, [count]) for name, count in counts(new, old).items() if count.new + count.old
     ]
     for quantity in SHARES_AND_TIMES:
         before: Quantiles | None = getattr(old, quantity)
         if before is not None and len(after := known(values[quantity])):
-            found += [quantile_test(*place, quantity, name, before, after) for name in QUANTILES]
+            found += [quantile_test(place, quantity, name, before, after) for name in QUANTILES]
     if "nees" in new.means and "nees" in old.means:
-        found += mean_test(*place, "nees", [(new.means["nees"], old.means["nees"])])
+        found += mean_test(place, "nees", [(new.means["nees"], old.means["nees"])])
     return found
 
 
 def counts(new: CellResults, old: CellResults) -> dict[str, Count]:
     """Return the counts of a cell by their names."""
     under = " under attack" if attacked(old.label) else ""
-    found = {
-        outcome + under: Count(
-            new.outcomes.get(outcome, 0), new.trials, old.outcomes.get(outcome, 0), old.trials
-        )
-        for outcome in ("localised", "undecided", "inconsistent")
-    }
-    found["failed"] = Count(
-        new.outcomes.get("failed", 0), new.trials, old.outcomes.get("failed", 0), old.trials
-    )
+    found = {}
+    for name in ("localised", "undecided", "inconsistent", "failed"):
+        number = [one.outcomes.get(name, 0) for one in (new, old)]
+        called = name if name == "failed" else name + under
+        found[called] = Count(number[0], new.trials, number[1], old.trials)
     found["wrong"] = Count(new.wrong, new.trials, old.wrong, old.trials)
     refused = [one.outcomes.get("refused", 0) for one in (new, old)]
     found["refused"] = Count(refused[0], new.trials + refused[0], refused[1], old.trials + refused[1])
@@ -177,19 +182,12 @@ def attacked(label: str) -> bool:
     return "attack = " in label and "attack = honest" not in label
 
 
-def _pooled(level: Level, sweep: str, runs: Sequence[Run]) -> list[Test]:
+def _pooled(place: Place, runs: Sequence[Run]) -> list[Test]:
     """Return the tests of what is pooled over all cells of `runs`."""
     pairs = [pair for run in runs for pair in zip(run.new.cell, run.old.cell, strict=True)]
     by_cell = [counts(new, old) for new, old in pairs]
     found = [
-        count_test(
-            level,
-            sweep,
-            "all cells",
-            name,
-            [one[name] for one in by_cell if name in one],
-            one_sided=name in BAD,
-        )
+        count_test(place, name, [one[name] for one in by_cell if name in one], one_sided=name in BAD)
         for name in dict.fromkeys([name for one in by_cell for name in one])
     ]
     for name in TRANSFORMED:
@@ -198,13 +196,11 @@ def _pooled(level: Level, sweep: str, runs: Sequence[Run]) -> list[Test]:
             for new, old in pairs
             if name in new.means and name in old.means
         ]
-        found += mean_test(level, sweep, "all cells", name, means)
+        found += mean_test(place, name, means)
     return found
 
 
-def count_test(
-    level: Level, sweep: str, where: str, quantity: str, counts: Sequence[Count], *, one_sided: bool = False
-) -> Test:
+def count_test(place: Place, quantity: str, counts: Sequence[Count], *, one_sided: bool = False) -> Test:
     """Return the test of a count, summed over cells; if it is one-sided, that of more events."""
     new, of_new = sum([one.new for one in counts]), sum([one.of_new for one in counts])
     old, of_old = sum([one.old for one in counts]), sum([one.of_old for one in counts])
@@ -221,10 +217,7 @@ def count_test(
         return "none"
 
     return Test(
-        level,
-        sweep,
-        where,
-        quantity,
+        *(*place, quantity),
         f"{old} of {of_old}",
         f"{new} of {of_new}",
         more if one_sided else min(1.0, 2.0 * min(more, fewer)),
@@ -248,9 +241,7 @@ def conditional(counts: Sequence[Count]) -> tuple[float, float]:
     return min(1.0, float(pmf[at:].sum())), min(1.0, float(pmf[: at + 1].sum()))
 
 
-def quantile_test(
-    level: Level, sweep: str, where: str, quantity: str, name: str, old: Quantiles, new: Floats
-) -> Test:
+def quantile_test(place: Place, quantity: str, name: str, old: Quantiles, new: Floats) -> Test:
     """Return the test of the quantile `name` of the file against new values."""
     p = QUANTILES[name]
     at: float = getattr(old, name)
@@ -271,10 +262,7 @@ def quantile_test(
         return f"x{at / there:.3g}" if there > 0.0 else "none"
 
     return Test(
-        level,
-        sweep,
-        where,
-        f"{quantity}, {name}",
+        *(*place, f"{quantity}, {name}"),
         f"{at:.4g} ({old.n})",
         f"{after:.4g} ({len(new)})",
         min(1.0, 2.0 * min(larger, smaller)),
@@ -291,9 +279,7 @@ def below(n: int, k: int, m: int) -> Floats:
     return np.asarray(np.minimum(np.cumsum(pmf), 1.0), float)
 
 
-def mean_test(
-    level: Level, sweep: str, where: str, quantity: str, pairs: Sequence[tuple[Mean, Mean]]
-) -> list[Test]:
+def mean_test(place: Place, quantity: str, pairs: Sequence[tuple[Mean, Mean]]) -> list[Test]:
     """Return the test of a mean over cells, each new and old; none if there are too few values.
 
     Each cell has one variance on both sides if nothing has changed.
@@ -315,19 +301,8 @@ def mean_test(
         least = float(t.isf(0.5 * alarm, freedom) + t.ppf(POWER, freedom)) * error
         return f"{least:.3g}" if quantity == "nees" else f"x{math.exp(least):.3g}"
 
-    return [
-        Test(
-            level,
-            sweep,
-            where,
-            quantity,
-            _back(quantity, old),
-            _back(quantity, new),
-            float(2.0 * t.sf(abs(change) / error, freedom)),
-            change,
-            smallest,
-        )
-    ]
+    p = float(2.0 * t.sf(abs(change) / error, freedom))
+    return [Test(*place, quantity, _back(quantity, old), _back(quantity, new), p, change, smallest)]
 
 
 def _back(quantity: str, value: float) -> str:
@@ -335,7 +310,7 @@ def _back(quantity: str, value: float) -> str:
     return f"{value**3 if quantity == 'nees' else math.exp(value):.4g}"
 
 
-def _paired(level: Level, sweep: str, runs: Sequence[Run]) -> list[Test]:
+def _paired(place: Place, runs: Sequence[Run]) -> list[Test]:
     """Return the sign tests of trials with the same seeds as those in the files; none with other seeds."""
     pairs = [paired_trials(run) for run in runs if run.new.seed == run.old.seed]
     found = []
@@ -347,10 +322,7 @@ def _paired(level: Level, sweep: str, runs: Sequence[Run]) -> list[Test]:
         tails = [float(binom.sf(one - 1, more + fewer, 0.5)) for one in (more, fewer)]
         found.append(
             Test(
-                level,
-                sweep,
-                f"same seeds, {len(change)}",
-                name,
+                *(*place._replace(where=f"same seeds, {len(change)}"), name),
                 f"more in {more}",
                 f"less in {fewer}",
                 tails[0] if name == "wrong" else min(1.0, 2.0 * min(tails)),

@@ -1,24 +1,32 @@
-"""Ranges that are depths along the heading of the robot, as of a camera, are recognised, and used as such."""
+"""Claims of recorded robots: none on ranges that disagree, late odometry, or depths taken for distances."""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
+from agent.estimation.claim import CONDITIONS, Condition, odometry_on_time, parts, parts_before
+from agent.estimation.fit import Fit
 from agent.estimation.following import ClaimRule
 from compose import scenario
 from compose.errors import USER_ERROR
 from compose.recording.estimating.estimate_rows import LearnedError
 from compose.recording.estimating.estimate_run import RecordingEstimate, estimated
+from compose.recording.estimating.noise_files import AssumedNoise
 from compose.recording.estimating.recorded_measurements import measurements
+from compose.recording.estimating.recording_estimator import RecordingEstimator
 from compose.recording.ranging.range_recording import FixedAnchor, RangeRecording
+from docs import recorded_windows
 from docs.recorded_windows import is_wrong
+from protocol.noise import Noise
 from tests.commands import refused, tandem
-from tests.range_tables import written_csv
-from tests.test_anchored import driven
+from tests.range_tables import SAMPLE, written_csv
+from tests.test_anchored import ANCHORS, driven
 
 NOISY = Path(scenario.__file__).parent / "shipped" / "noisy.toml"
 SIGMA = 0.05
@@ -52,8 +60,10 @@ def seen(seed: int, *, share: float, yaw: float = 0.0) -> RangeRecording:
     return recording._replace(ranges=told.rows(np.isfinite(nearest[which, at])))
 
 
-def estimate_of(recording: RangeRecording, noise: str | None = None) -> RecordingEstimate:
-    return estimated(measurements(recording, None, noise), ClaimRule())
+def estimate_of(
+    recording: RangeRecording, noise: str | None = None, conditions: Sequence[Condition] = CONDITIONS
+) -> RecordingEstimate:
+    return estimated(measurements(recording, None, noise), ClaimRule(conditions=conditions))
 
 
 def depth_of(found: RecordingEstimate) -> LearnedError:
@@ -135,3 +145,100 @@ def test_estimate_and_calibrate_say_that_ranges_are_depths(tmp_path: Path, share
     assert ("the ranges are depths along the headings, as of a camera: a share of" in ended.out) == (
         share > 0.0
     )
+
+
+SHARED_SIGMA, LASTS_S = 0.2, 8.0
+
+
+def with_shared_error(seed: int) -> RangeRecording:
+    """Return a recording whose ranges are off together by SHARED_SIGMA (m), for LASTS_S.
+
+    Only SIGMA is stated. There are two anchors. The odometry has the noise that it states.
+    """
+    recording, draws = driven(ANCHORS[:2], sigma=SIGMA, seed=seed), np.random.default_rng([seed, 7])
+    ranges, (robot,) = recording.ranges, recording.robots
+    off = [SHARED_SIGMA * draws.standard_normal()]
+    for lasted in np.diff(ranges.t).tolist():
+        share = math.exp(-lasted / LASTS_S)
+        off.append(share * off[-1] + SHARED_SIGMA * math.sqrt(1.0 - share**2) * draws.standard_normal())
+    sigmas = np.array((0.002, 0.002, 0.004))
+    increments = robot.odometry.increments
+    increments = increments + draws.normal(size=increments.shape) * sigmas
+    covariance = np.tile(np.diag(sigmas**2), (len(increments), 1, 1))
+    odometry = robot.odometry._replace(increments=increments, covariance=covariance)
+    return recording._replace(
+        robots=(robot._replace(odometry=odometry),),
+        ranges=ranges._replace(range=ranges.range + off, sigma=np.full(len(ranges.t), SIGMA)),
+    )
+
+
+@pytest.mark.parametrize("seed", [4, 45])
+def test_errors_that_all_ranges_share_lead_to_no_wrong_claim(seed: int) -> None:
+    recording = with_shared_error(seed)
+    assert not any(is_wrong(row) for row in estimate_of(recording, "wheels").rows if row.claim)
+    others = tuple([one for one in CONDITIONS if one not in (parts, parts_before)])
+    found = estimate_of(recording, "wheels", others)
+    assert any(is_wrong(row) for row in found.rows if row.claim)
+
+
+def fit_of(**priors: float) -> Fit:
+    """Return the last fit to ranges that are five times as accurate as told, with some priors of errors."""
+    untold = dict.fromkeys(("range_bias", "pair_bias", "range_scale", "wheel_scale", "gyro_bias"), 0.0)
+    noise = replace(Noise(anchor_sigma=SIGMA, mutual_sigma=SIGMA), **{**untold, **priors})
+    found = measurements(driven(sigma=0.2 * SIGMA), None, AssumedNoise("told", noise), (0.0, 15.0))
+    (*_, epoch) = RecordingEstimator(ClaimRule()).epochs(found)
+    assert epoch.fitted is not None
+    assert epoch.fitted.fit.level < 0.5
+    return epoch.fitted.fit
+
+
+def test_without_other_errors_a_low_noise_level_scales_the_covariance() -> None:
+    fit = fit_of()
+    assert np.allclose(fit.covariance, fit.level * fit.linear.step.ends, rtol=0.01, atol=1e-9)
+
+
+def test_small_residuals_do_not_tell_that_biases_are_small() -> None:
+    fit = fit_of(pair_bias=0.2)
+    told, scaled = fit.linear.step.ends, fit.level * fit.linear.step.ends
+    assert np.linalg.eigvalsh(fit.covariance - scaled).min() > -1e-9
+    assert np.linalg.eigvalsh(told - fit.covariance).min() > -1e-9
+    assert np.trace(fit.covariance[:2, :2]) > 2.0 * np.trace(scaled[:2, :2])
+
+
+@pytest.mark.long
+def test_the_table_of_recordings_has_a_row_for_each_series(capsys: pytest.CaptureFixture[str]) -> None:
+    recorded_windows.main(["--tiers", str(SAMPLE)])
+    head, _, row = [line.strip("| ").split(" | ") for line in capsys.readouterr().out.splitlines()]
+    cells = dict(zip(head, row, strict=True))
+    assert (cells["recording"], cells["windows"], cells["with a claim"]) == ("TIERS, pairs", "1", "1")
+    assert (int(cells["claims"]) > 10, cells["wrong"], cells["of robots"]) == (True, "0", "-")
+
+
+LATE_S = 0.4
+
+
+def with_late_odometry(late_s: float) -> RangeRecording:
+    """Return a recording whose odometry is stamped late, though its ranges and true poses are not."""
+    recording = driven(sigma=SIGMA)
+    (robot,) = recording.robots
+    odometry = robot.odometry._replace(t0=robot.odometry.t0 + late_s, t1=robot.odometry.t1 + late_s)
+    return recording._replace(robots=(robot._replace(odometry=odometry),))
+
+
+def wrong(found: RecordingEstimate) -> int:
+    judged = [row for row in found.rows if row.claim and row.position_error_m is not None]
+    return sum(map(is_wrong, judged))
+
+
+def test_odometry_that_is_stamped_late_is_named_and_holds_back_claims() -> None:
+    recording = with_late_odometry(LATE_S)
+    found = estimate_of(recording, "uwb")
+    assert "its odometry seems to be 0.28 s late" in found.summary.blocking_reason  # the prior is 0.1 s
+    others = tuple([one for one in CONDITIONS if one is not odometry_on_time])
+    assert wrong(estimate_of(recording, "uwb", others)) > 5 * wrong(found)
+
+
+def test_ranges_that_are_stamped_late_hold_back_no_claim() -> None:
+    found = estimate_of(with_late_odometry(-LATE_S), "uwb")
+    assert found.summary.blocking_reason == ""
+    assert any(row.claim for row in found.rows)
