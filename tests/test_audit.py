@@ -140,13 +140,14 @@ def frames_of_paper_1() -> dict[str, list[bytes]]:
     return kept(load("paper-1"))
 
 
-@pytest.mark.parametrize("name", series([WORLD_JOURNAL, A, B]))
+@pytest.mark.parametrize("cuts", series([(WORLD_JOURNAL, 4), (WORLD_JOURNAL, 1), (A, 1), (B, 1)]))
 def test_a_journal_that_breaks_off_anywhere_breaks_no_other_rule(
-    name: str, frames_of_paper_1: dict[str, list[bytes]]
+    cuts: tuple[str, int], frames_of_paper_1: dict[str, list[bytes]]
 ) -> None:
+    name, each = cuts
     whole = frames_of_paper_1[name]
     begin, dense = 2 * (name == WORLD_JOURNAL), len(whole) - 9  # at least the scenario of the world
-    for count in [*range(begin, dense, 4), *range(dense, len(whole))]:
+    for count in [*range(begin, dense, each), *range(dense, len(whole))]:
         findings = audit_run(of_frames(frames_of_paper_1 | {name: whole[:count]}))
         if name == WORLD_JOURNAL and count >= len(whole) - 2:  # a FinalReport is lacking, or both
             assert {one.what for one in findings.violations} == {"the world has no FinalReport from it"}
