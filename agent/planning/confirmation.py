@@ -9,11 +9,9 @@ is honest, so a pose is right if its covariance covers the poses of f + 1 meetin
 
 from __future__ import annotations
 
-from itertools import combinations
-
 from msgspec.structs import replace
 
-from agent.estimation.gaussian.claim_agreement import united
+from agent.estimation.gaussian.claim_agreement import agreed
 from agent.estimation.gaussian.followed_pair import later_pose
 from agent.planning import appointments
 from agent.planning.state import RobotState
@@ -115,17 +113,16 @@ def _is_comparison_due(state: RobotState) -> bool:
 def _confirmed(state: RobotState) -> RobotState:
     """Return `state` with a claim that covers the poses of enough meetings which agree, if it is accurate."""
     config, confirming = state.config, state.confirming
-    needed = config.tolerates + 1
-    if len(confirming.meetings) < needed:
+    if len(confirming.meetings) <= config.tolerates:
         return state
     state = replace(state, confirming=replace(confirming, ranges=len(state.log.ranges)))
     poses = {one.config.peer: later_pose(one, state) for one in confirming.meetings}
-    present_poses = [(peer, pose) for peer, pose in poses.items() if pose is not None]
-    for chosen in combinations(present_poses, needed):
-        claim = united([pose for _, pose in chosen], config.mission)
-        if claim is not None:
-            peers = [peer for peer, _ in chosen]
-            meetings = sorted(confirming.meetings, key=lambda one: one.config.peer in peers)
-            confirming = replace(state.confirming, meetings=tuple(meetings))
-            return replace(state, robot_verdict=claim, confirming=confirming).with_frame(claim.pose)
-    return state
+    present_poses = {peer: pose for peer, pose in poses.items() if pose is not None}
+    found = agreed([*present_poses.values()], config.tolerates, config.mission)
+    if found is None:
+        return state
+    claim, chosen = found
+    peers = [[*present_poses][k] for k in chosen]
+    meetings = sorted(confirming.meetings, key=lambda one: one.config.peer in peers)
+    confirming = replace(state.confirming, meetings=tuple(meetings))
+    return replace(state, robot_verdict=claim, confirming=confirming).with_frame(claim.pose)

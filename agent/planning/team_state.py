@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping
-from itertools import combinations
 from typing import NamedTuple
 
 import msgspec
@@ -12,7 +11,7 @@ from msgspec.structs import replace
 
 from agent.estimation.claim import CONDITIONS, WITHOUT_FITS, blocked
 from agent.estimation.following import ClaimRule, Following
-from agent.estimation.gaussian.claim_agreement import united
+from agent.estimation.gaussian.claim_agreement import agreed
 from agent.estimation.gaussian.joint_claims import undetermined
 from agent.estimation.gaussian.search import position_sigma
 from agent.estimation.posterior import Hypothesis, certainties, same
@@ -244,10 +243,11 @@ def claimed(state: TeamState) -> TeamState:
     if not state.joint.why_not:
         return _with_verdict(state, state.following.judged[state.config.robot].localised)
     claiming = [pair.following for pair in state.pairs if not pair.why_not]
-    for agreed in combinations(claiming, state.config.tolerates + 1):
-        claim = united([one.judged[state.config.robot].localised for one in agreed], state.config.mission)
-        if claim is not None:  # one of these robots is honest
-            return _with_verdict(replace(state, joint=state.joint._replace(following=agreed[-1])), claim)
+    claims = [one.judged[state.config.robot].localised for one in claiming]
+    if (found := agreed(claims, state.config.tolerates, state.config.mission)) is not None:
+        claim, chosen = found
+        joint = state.joint._replace(following=claiming[chosen[-1]])
+        return _with_verdict(replace(state, joint=joint), claim)
     late = state.tick * state.config.mission.period >= state.config.gives_up
     if late or state.following.displacement_confirmed:
         return _with_verdict(state, Undecided(state.joint.why_not))

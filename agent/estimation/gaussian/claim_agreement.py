@@ -118,6 +118,21 @@ def covariance_union(claims: Sequence[Localised]) -> Localised:
     return Localised(best.pose, covariance_of(union))
 
 
+def agreed(
+    claims: Sequence[Localised], tolerates: int, mission: Mission
+) -> tuple[Localised, tuple[int, ...]] | None:
+    """Return the claim that covers `tolerates` + 1 of `claims`, and their indices; None if none does.
+
+    They are of one robot and tick, by different peers. If at most `tolerates` of these report false data, one
+    of the claims is right.
+    """
+    for chosen in combinations(range(len(claims)), tolerates + 1):
+        claim = united([claims[k] for k in chosen], mission)
+        if claim is not None:
+            return claim, chosen
+    return None
+
+
 def united(claims: Sequence[Localised], mission: Mission) -> Localised | None:
     """Return the claim that covers all of `claims`, of one robot and tick; None if it is none.
 
