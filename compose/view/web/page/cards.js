@@ -12,9 +12,7 @@ const OUTCOMES = ["inconsistent", "undecided", "running", "localised"]; // the w
 
 export class Cards {
   constructor(root, roster, choose) {
-    this.root = root;
-    this.roster = roster;
-    this.choose = choose;
+    Object.assign(this, { root, roster, choose });
   }
 
   stage(store) {

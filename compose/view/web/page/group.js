@@ -15,8 +15,8 @@ const HUES = { "robot-a": "localised", "robot-b": "unlocalised" };
 export const group_marks = (marks, team) => new Set([...[...marks].map((mark) => HUES[mark] ?? mark), ...(team ? [] : ["meeting"])]);
 
 /** Draws a thin arrow for each meeting, between the anchors: dotted until the visited robot is localised. */
-export function draw_tree(pen, plane, { store, tick, look }) {
-  const reach = store.stage.mission.sensing_range * plane.scale;
+export function draw_tree(plane, { store, tick, look }) {
+  const pen = plane.context, reach = store.stage.mission.sensing_range * plane.scale;
   for (const { visitor, visited } of store.stage.visits) {
     const anchors = [visitor, visited].map((id) => store.stage.robots[store.places.get(id)].anchor), [from, to] = anchors.map((one) => plane.at(one));
     if (!plane.sees(...[Math.min, Math.max].map((end) => [0, 1].map((i) => end(...anchors.map((one) => one[i])))))) continue;
