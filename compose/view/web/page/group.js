@@ -56,7 +56,8 @@ export function task(player, robot) {
   if (state === "localised" || (verdict && verdict[0] !== "localised")) return verdict?.[0] ?? state;
   if (waits(player)) return "waiting";
   if (phase === 3 && robot.anchor && state !== "looping") return `meets ${robot.peer}`;
-  return robot.own_planner || ["sweeping", "looping"].includes(state) ? state : (robot.peer ? PHASES : STEPS)[phase];
+  if (state === "sweeping") return "covers the area";
+  return robot.own_planner || state === "looping" ? state : (robot.peer ? PHASES : STEPS)[phase];
 }
 
 /** Returns whether a robot waits for another one: beside its anchor, or without an anchor where it is. */
@@ -69,8 +70,8 @@ export function counted(players, team) {
   const is = (kind) => players.filter((player) => player?.command?.verdict?.[0] === kind).length;
   const travelling = players.filter((player) => player?.command?.state === TRAVELLING).length;
   const waiting = players.filter((player) => player && waits(player)).length;
-  const sweeping = players.filter((player) => ["sweeping", "looping"].includes(player?.command?.state) && player.command.verdict).length;
+  const covering = players.filter((player) => ["sweeping", "looping"].includes(player?.command?.state) && player.command.verdict).length;
   const others = ["inconsistent", "undecided"].filter(is).map((kind) => `${is(kind)} ${kind}`);
-  const ways = [`${travelling} travelling`, ...(sweeping ? [`${sweeping} sweeping`] : []), `${waiting} waiting`];
+  const ways = [`${travelling} travelling`, ...(covering ? [`${covering} covering the area`] : []), `${waiting} waiting`];
   return [...others, `${is("localised")} of ${plural(players.length, "robot")} localised`, ...(team ? [] : ways)].join(", ");
 }

@@ -354,9 +354,9 @@ function controls() {
   hide($("notes"), !notes);
   const subject = view.focus ?? "each robot";
   const bearing = store.stage.team || knows_bearing() ? "" : "; the bearing from the anchor is arbitrary until the robot is placed in the world";
-  const only = store.has_truth ? `only the belief of ${subject}` : `no ground truth: only the belief of ${subject}`;
+  const only = `${store.has_truth ? "" : "no ground truth: "}only the posterior of ${subject}`;
   const unknown = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the ground truth of this tick is unknown" : "";
-  text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the belief of ${subject}` : ""));
+  text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the posterior of ${subject}` : ""));
   attribute($("canvas"), "aria-label", described(store, view));
 }
 

@@ -1,4 +1,4 @@
-// The plane in one tick: anchors, trails, robots, ranges, reports and beliefs.
+// The plane in one tick: anchors, trails, robots, ranges, reports and posteriors.
 
 import { Backdrop } from "./backdrop.js";
 import { Beliefs } from "./beliefs.js";
