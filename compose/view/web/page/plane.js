@@ -35,6 +35,8 @@ const LEAST_PX = 40;
 const INSET = 0.2, ZOOMED = 2.5;
 /** The largest number of robots of a group that always have their names; those of one pair have them, too. */
 const NAMED = 20;
+/** The texts over the plane. */
+const OVER = [...document.querySelectorAll("#stage :is(p, ul), #legend :is(summary, ul)")];
 
 /** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
 export class Plane {
@@ -387,10 +389,8 @@ export class Plane {
   /** Returns the boxes of the texts over the plane, as [left, top, right, bottom]. */
   #overlays() {
     const { left, top } = this.canvas.getBoundingClientRect(), scale = unit();
-    return [...document.querySelectorAll("#stage :is(p, ul), #legend summary, #legend[open] ul")].filter((one) => one.textContent && !one.hidden).map((one) => {
-      const box = one.getBoundingClientRect();
-      return [(box.left - left) / scale, (box.top - top) / scale, (box.right - left) / scale, (box.bottom - top) / scale];
-    });
+    const seen = OVER.filter((one) => one.firstChild && !one.hidden && (one.tagName !== "UL" || one.parentElement.open !== false));
+    return seen.map((one) => one.getBoundingClientRect()).map((box) => [box.left - left, box.top - top, box.right - left, box.bottom - top].map((side) => side / scale));
   }
 
   // --- robots ---
