@@ -305,7 +305,7 @@ def test_without_the_truth_the_page_opens_with_the_estimates(
         until_shown(page, 48)
         expect(page.locator("#truth")).not_to_be_checked()
         expect(page.locator("#truth")).to_be_disabled()
-        expect(page.locator("#seen")).to_have_text("no ground truth: only the belief of each robot")
+        expect(page.locator("#seen")).to_have_text("no ground truth: only the posterior of each robot")
         expect(page.locator("#canvas")).to_have_attribute(
             "aria-label", re.compile(r"The plane at tick 48: a at .*; b at ")
         )

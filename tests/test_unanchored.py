@@ -451,7 +451,9 @@ def test_the_page_shows_the_sweep_and_the_robots_that_it_finds(opened: Open, tmp
         assert {"u", "anchor of a"} <= set(labels)
         assert "anchor of u" not in labels
         scrub_to(page, found - 1)
-        expect(page.locator("#caption")).to_have_text("a and b sweep the area for robots without an anchor.")
+        expect(page.locator("#caption")).to_have_text(
+            "a and b cover the area to find robots without an anchor."
+        )
         expect(page.locator("body")).to_contain_text("no anchor")
         shot(page, "without-anchor")
         page.locator("#truth").uncheck()

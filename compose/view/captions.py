@@ -180,7 +180,7 @@ def group_beginning(group: PairData) -> Told:
     text = f"{number} robots measure no more than the distance to their own anchor"
     if found := len(setup.robots) - len(setup.anchored):
         text += f", and {found} have none"
-        meet += " At last, they sweep the area for those without an anchor."
+        meet += " At last, they cover the area to find those without an anchor."
     yield Caption("ranging", f"{text}. {meet}", truth=attacked(group, "will report"))
 
 
@@ -274,8 +274,8 @@ def departing(group: PairData) -> Told:
         robot for robot, (was, task) in tasks.items() if task == "sweeping" and was not in (task, "looping")
     ]
     if sweeps:
-        verb = "sweeps" if len(sweeps) == 1 else "sweep"
-        text = f"{listed(sweeps)} {verb} the area for robots without an anchor."
+        verb = "covers" if len(sweeps) == 1 else "cover"
+        text = f"{listed(sweeps)} {verb} the area to find robots without an anchor."
         yield Caption("search", text, tuple(sweeps))
     leaving = [robot for robot, (was, task) in tasks.items() if task == TRAVELLING != was]
     found = [(robot, peer) for robot in leaving if (peer := group.setup.robot_setup(robot).peer)]

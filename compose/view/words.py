@@ -26,7 +26,7 @@ DOING = {
     "tangent": "{robot} turns from the radius onto its orbit",
     "orbiting": "{robot} drives on its orbit until {peer} is in range",
     "travelling": "{robot} drives to {peer} to localise it",
-    "sweeping": "{robot} sweeps an area for robots without an anchor",
+    "sweeping": "{robot} covers an area to find robots without an anchor",
     "looping": "{robot} drives loops, so that a robot without an anchor is localised by ranges",
     "standing": "{robot} stands still and waits for {peer}'s second range",
     "waiting": "{robot} stands still and waits for {peer}'s last manoeuvre",

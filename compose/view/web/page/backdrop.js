@@ -1,50 +1,29 @@
 // What stays the same between two ticks: the grid, the anchors with their ranges and orbits, and the trails up to the
-// tick. But for the grid, it is drawn once for many pictures: while the camera eases, the last one moves with it.
+// tick. But for the grid, it is a layer.
 
 import { TAU } from "./geometry.js";
 import { draw_tree } from "./group.js";
+import { Layer } from "./layer.js";
 import { DASHED, line, stroked } from "./pen.js";
 import { rounded_up } from "./strip.js";
 import { metres } from "./words.js";
 
 const FEW = 4; // anchors of a team whose ranges are drawn in full colours
 const LEGIBLE = 26; // the least radius in pixels of an anchor's range with which the anchor has a label
-const PAD = 128; // the pixels of the canvas around the plane that are drawn, too
 const ZOOMED = 0.15; // by which the picture is scaled at most while the camera eases
 
 export class Backdrop {
-  constructor(plane, trails) {
-    Object.assign(this, { plane, trails, canvas: document.createElement("canvas") });
-    this.pen = this.canvas.getContext("2d");
-  }
+  constructor(plane, trails) { Object.assign(this, { plane, trails, layer: new Layer(plane, ZOOMED) }); }
 
   #told = "";
-  /** The camera with which the picture is drawn. */
-  #centre = [0, 0];
-  #scale = 1;
 
-  /**
-   * Draws the grid, copies the backdrop to the plane, and adds the labels and targets of the robots that are `near`.
-   *
-   * The backdrop is drawn again if something in it has changed, or the camera; while that eases, only once it has moved far.
-   */
-  draw(view, robots, near, ratio) {
-    const { plane } = this, { store, tick, focus, truth, look } = view, { width, height } = plane.canvas;
-    const known = [store.name, store.revision, store.last, Math.min(store.whole, tick + 1), Boolean(view.scene), robots.length];
-    const told = [...known, tick, focus, truth, plane.fine, width, height, ratio, look.paper].join();
+  /** Draws the grid and the backdrop, and adds the labels and targets of the robots that are `near`. */
+  draw(view, robots, near) {
+    const { plane } = this, { store, truth, look } = view, told = [view.known, robots.length, plane.fine].join();
     this.#grid(look);
-    const moved = String([...plane.centre, plane.scale]) !== String([...this.#centre, this.#scale]);
-    if (told !== this.#told || (moved && (!plane.easing || this.#far()))) {
-      if (told !== this.#told) this.styles = truth ? this.trails.styles(view, robots) : [];
-      plane.padded(PAD / ratio, () => this.#picture(view, robots, ratio));
-      [this.#told, this.#centre, this.#scale] = [told, plane.centre, plane.scale];
-    }
-    const zoom = plane.scale / this.#scale, size = [width, height].map((one) => zoom * (one + 2 * PAD));
-    const corner = plane.at(this.#centre).map((one, i) => ratio * one - size[i] / 2);
-    plane.context.save();
-    plane.context.setTransform(1, 0, 0, 1, 0, 0);
-    plane.context.drawImage(this.canvas, ...(zoom === 1 ? corner.map(Math.round) : corner), ...size);
-    plane.context.restore();
+    if (told !== this.#told) this.styles = truth ? this.trails.styles(view, robots) : [];
+    this.#told = told;
+    this.layer.show(told, view.ratio, () => this.#picture(view, robots));
     plane.labels.placed.push(this.bar);
     for (const robot of near) if (robot.anchor) this.#name(view, robot, `anchor of ${robot.id}`);
     for (const one of this.#shared(view)) this.#name(view, one, one.id);
@@ -54,27 +33,12 @@ export class Backdrop {
     for (const mark of [...marks, ...this.paths]) plane.marks.add(mark);
   }
 
-  /** Returns whether the camera is too far from that of the picture: part of the plane would be empty, or the picture blurred. */
-  #far() {
-    const { plane } = this, size = [plane.width, plane.height], zoom = plane.scale / this.#scale, pad = (PAD * plane.width) / plane.canvas.width;
-    const covered = (one, i) => Math.abs(one - size[i] / 2) + size[i] / 2 <= zoom * (size[i] / 2 + pad);
-    return Math.abs(zoom - 1) > ZOOMED || !plane.at(this.#centre).every(covered);
-  }
-
-  /** Draws the picture, on a plane with the pixels around it. */
-  #picture(view, robots, ratio) {
-    const { plane, pen, canvas } = this, { store, look } = view, { width, height } = plane.canvas;
-    const size = { width: width + 2 * PAD, height: height + 2 * PAD };
-    if (Object.entries(size).some(([name, pixels]) => canvas[name] !== pixels)) Object.assign(canvas, size);
-    pen.setTransform(1, 0, 0, 1, 0, 0);
-    pen.clearRect(0, 0, canvas.width, canvas.height);
-    pen.setTransform(ratio, 0, 0, ratio, 0, 0);
-    pen.lineCap = pen.lineJoin = "round";
-    if (store.grouped && view.truth) draw_tree(pen, plane, view);
+  #picture(view, robots) {
+    if (view.store.grouped && view.truth) draw_tree(this.plane, view);
     for (const robot of robots) if (robot.anchor) this.#anchor(view, robot);
     for (const one of this.#shared(view)) this.#anchor(view, one);
-    this.trails.trails(pen, view, this.styles);
-    this.paths = [...plane.marks]; // the trails have named them
+    this.trails.trails(view, this.styles);
+    this.paths = [...this.plane.marks]; // the trails have named them
   }
 
   /** Returns the anchors of a team that are drawn: those that no robot knows with the ground truth only. */
@@ -109,7 +73,7 @@ export class Backdrop {
 
   /** Draws the range of an anchor, and its robot's orbit or, in a team, three sigmas of its position. */
   #anchor(view, robot) {
-    const { pen, plane } = this, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
+    const { plane } = this, pen = plane.context, { look } = view, { at: [x, y], reach, alpha } = this.#place(view, robot);
     const [mx, my] = robot.anchor, far = Math.max(reach / plane.scale, robot.orbit?.[0] ?? 0);
     if (view.store.estimated || (robot.orbit && !plane.sees([mx - far, my - far], [mx + far, my + far]))) return;
     pen.globalAlpha = alpha * Math.min(1, FEW / view.store.stage.anchors.length);

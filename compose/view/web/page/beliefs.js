@@ -120,7 +120,7 @@ export class Beliefs {
   #ruled_out(view, robot) {
     const { store, truth, look, size, tick, share, moving } = view;
     const pen = this.plane.context, period = store.stage.mission.period;
-    const { poses } = held_now({ ...view, moving: false }, robot);
+    let poses = null;
     for (let age = 1; age <= FADING && tick - age >= 0; age++) {
       const held = store.player(tick - age, robot.id)?.held;
       const later = store.player(tick - age + 1, robot.id)?.held;
@@ -130,6 +130,7 @@ export class Beliefs {
       const had = in_world ? held.world : held.local.map((local) => compose(frame, local));
       const has = in_world ? later.world : later.local.map((local) => compose(frame, local));
       if (has.length >= had.length) continue;
+      poses ??= held_now({ ...view, moving: false }, robot).poses;
       for (let pose of had.slice(0, 60)) {
         for (let k = tick - age + 1; k <= tick; k++) {
           const driven = store.player(k, robot.id)?.executed;

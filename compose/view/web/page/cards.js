@@ -1,4 +1,4 @@
-// The cards beside the plane: each robot's activity, measurements, command and belief.
+// The cards beside the plane: each robot's activity, measurements, command and posterior.
 
 import { distance, wrap } from "./geometry.js";
 import { counted, task } from "./group.js";
@@ -12,9 +12,7 @@ const OUTCOMES = ["inconsistent", "undecided", "running", "localised"]; // the w
 
 export class Cards {
   constructor(root, roster, choose) {
-    this.root = root;
-    this.roster = roster;
-    this.choose = choose;
+    Object.assign(this, { root, roster, choose });
   }
 
   stage(store) {
@@ -114,7 +112,7 @@ class Card {
     this.root.classList.toggle("chosen", chosen);
     this.root.dataset.role = this.robot.role;
     this.name.setAttribute("aria-pressed", String(chosen));
-    this.name.title = chosen ? "Show all robots (A)" : `Show the belief of ${this.robot.id}`;
+    this.name.title = chosen ? "Show all robots (A)" : `Show the posterior of ${this.robot.id}`;
     if (!player) return void (this.doing.textContent = "…");
     const { command, held } = player;
     const phase = store.phase(tick, this.robot.id);
@@ -131,7 +129,7 @@ class Card {
     this.error.title = range;
     this.#row("measured", measured(player) || "nothing");
     this.#row("command", command ? commanded(command) : "–");
-    this.#row("belief", held ? believed(held) : "–");
+    this.#row("posterior", held ? believed(held) : "–");
     if (truth) this.#row("true pose", player.pose ? `${place(player.pose)}, ${rad(player.pose[2])}` : "unknown");
     else if (this.fields.has("true pose")) this.#row("true pose", "hidden");
     this.#probability(held);

@@ -194,7 +194,10 @@ export class Charts {
         const text = this.#series ? strip.none : this.#failed ? "the series cannot be read" : "reading ...";
         pen.fillText(text, LEFT + this.#wide / 2, this.tall / 2 + 4);
       }
-      if (top + this.tall + GAP > (STRIPS.length / this.#columns) * (this.tall + GAP)) this.#numbers(pen, of("faint"));
+      if (top + this.tall + GAP > (STRIPS.length / this.#columns) * (this.tall + GAP)) {
+        pen.fillStyle = of("faint");
+        number_ticks(pen, ...this.#span, (tick) => this.#x(tick), this.tall + 12, 60);
+      }
       pen.restore();
     }
   }
@@ -273,11 +276,6 @@ export class Charts {
   #middle(bin) {
     const { first, last, step } = this.#series, begin = first + bin * step;
     return this.#x((begin + Math.min(begin + step - 1, last)) / 2);
-  }
-
-  #numbers(pen, colour) {
-    pen.fillStyle = colour;
-    number_ticks(pen, ...this.#span, (tick) => this.#x(tick), this.tall + 12, 60);
   }
 
   /** Draws the cursor and the values of its bin above each strip. */

@@ -71,7 +71,8 @@ export class Configurations {
     const ruling = view.eliminated < 1 && measured !== null;
     const driving = view.moving && view.share > 0 && store.player(tick, robot.id)?.contacts?.length;
     if (ruling || driving) {
-      const mover = this.#mover(store, ruling ? tick - 1 : tick, robot), of_a = mover === robot.id;
+      const last = joined(store.scene(ruling ? tick - 1 : tick), robot.id)?.manoeuvre;
+      const mover = last?.robot ?? robot.peer, of_a = mover === robot.id; // b if both drive
       if (ruling && truth && places.get(mover)) {
         this.plane.marks.add("measured");
         pen.globalAlpha = 0.2;
@@ -94,11 +95,6 @@ export class Configurations {
       });
     }
     pen.globalAlpha = 1;
-  }
-
-  /** Returns the robot that makes the last manoeuvre; b if both drive. */
-  #mover(store, tick, robot) {
-    return joined(store.scene(tick), robot.id)?.manoeuvre?.robot ?? robot.peer;
   }
 
   /** Draws an arrow along poses of a robot that drives with the speed `v`; `halo` is the width of its ground. */

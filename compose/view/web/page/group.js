@@ -15,8 +15,8 @@ const HUES = { "robot-a": "localised", "robot-b": "unlocalised" };
 export const group_marks = (marks, team) => new Set([...[...marks].map((mark) => HUES[mark] ?? mark), ...(team ? [] : ["meeting"])]);
 
 /** Draws a thin arrow for each meeting, between the anchors: dotted until the visited robot is localised. */
-export function draw_tree(pen, plane, { store, tick, look }) {
-  const reach = store.stage.mission.sensing_range * plane.scale;
+export function draw_tree(plane, { store, tick, look }) {
+  const pen = plane.context, reach = store.stage.mission.sensing_range * plane.scale;
   for (const { visitor, visited } of store.stage.visits) {
     const anchors = [visitor, visited].map((id) => store.stage.robots[store.places.get(id)].anchor), [from, to] = anchors.map((one) => plane.at(one));
     if (!plane.sees(...[Math.min, Math.max].map((end) => [0, 1].map((i) => end(...anchors.map((one) => one[i])))))) continue;
@@ -56,7 +56,8 @@ export function task(player, robot) {
   if (state === "localised" || (verdict && verdict[0] !== "localised")) return verdict?.[0] ?? state;
   if (waits(player)) return "waiting";
   if (phase === 3 && robot.anchor && state !== "looping") return `meets ${robot.peer}`;
-  return robot.own_planner || ["sweeping", "looping"].includes(state) ? state : (robot.peer ? PHASES : STEPS)[phase];
+  if (state === "sweeping") return "covers the area";
+  return robot.own_planner || state === "looping" ? state : (robot.peer ? PHASES : STEPS)[phase];
 }
 
 /** Returns whether a robot waits for another one: beside its anchor, or without an anchor where it is. */
@@ -69,8 +70,8 @@ export function counted(players, team) {
   const is = (kind) => players.filter((player) => player?.command?.verdict?.[0] === kind).length;
   const travelling = players.filter((player) => player?.command?.state === TRAVELLING).length;
   const waiting = players.filter((player) => player && waits(player)).length;
-  const sweeping = players.filter((player) => ["sweeping", "looping"].includes(player?.command?.state) && player.command.verdict).length;
+  const covering = players.filter((player) => ["sweeping", "looping"].includes(player?.command?.state) && player.command.verdict).length;
   const others = ["inconsistent", "undecided"].filter(is).map((kind) => `${is(kind)} ${kind}`);
-  const ways = [`${travelling} travelling`, ...(sweeping ? [`${sweeping} sweeping`] : []), `${waiting} waiting`];
+  const ways = [`${travelling} travelling`, ...(covering ? [`${covering} covering the area`] : []), `${waiting} waiting`];
   return [...others, `${is("localised")} of ${plural(players.length, "robot")} localised`, ...(team ? [] : ways)].join(", ");
 }

@@ -18,9 +18,7 @@ const FAULTS = new Set([...KILLS, "late", "report-lost", "report-damaged", "repo
 
 export class Guide {
   stage(store) {
-    this.store = store;
-    this.beats = [];
-    this.read = 0;
+    Object.assign(this, { store, beats: [], read: 0 });
     this.#span = null;
   }
 

@@ -25,7 +25,8 @@ export function held_now({ store, scene, truth, tick, share, moving }, robot) {
   const next = store.player(tick + 1, robot.id), { period, sensing_range } = store.stage.mission;
   if (!next?.executed) return { poses, covariance: held.covariance };
   const goals = next.held && (next.held.world.length > 0) === (held.world.length > 0) ? placed(next.held, frame) : [];
-  const pairs = matched(poses, goals, next.executed, period, NEAR * sensing_range);
+  if (followed.get(held)?.next !== next) followed.set(held, { next, pairs: matched(poses, goals, next.executed, period, NEAR * sensing_range) });
+  const { pairs } = followed.get(held);
   return {
     poses: poses.map((pose, i) => {
       const driven = between(pose, null, next.executed, share, period);
@@ -34,6 +35,9 @@ export function held_now({ store, scene, truth, tick, share, moving }, robot) {
     covariance: pairs[0] === 0 ? mixed(held.covariance, next.held.covariance, share) : held.covariance,
   };
 }
+
+/** The successors of the hypotheses of a tick in the `next` one. */
+const followed = new WeakMap();
 
 const placed = (held, frame) => (held.world.length ? held.world : held.local.map((local) => compose(frame, local)));
 

@@ -9,6 +9,8 @@ const EVERY = 6, HALF = 4;
 const MOST_PARTS = 60;
 /** The rank of the names of robots. */
 export const NAME = 2;
+/** The widths of texts in pixels, by font and text, so that each is measured once. */
+const widths = {};
 
 export class Labels {
   /** Starts a picture of `width` x `height`; labels keep clear of `obstacles`, [left, top, right, bottom]. */
@@ -42,7 +44,7 @@ export class Labels {
     const { pen } = this;
     for (const one of [...this.asked].sort((a, b) => b.rank - a.rank)) {
       pen.font = one.font;
-      const wide = pen.measureText(one.text).width, tall = Number(/(\d+(\.\d+)?)px/.exec(one.font)[1]);
+      const wide = widths[one.font + one.text] ??= pen.measureText(one.text).width, tall = Number(/(\d+(\.\d+)?)px/.exec(one.font)[1]);
       const spots = [[one.x, one.y], ...one.others].flatMap(([x, y]) => this.#spots({ ...one, x, y }, tall));
       const places = spots.map(([x, y, align]) => ({ x, y, align, box: box_of(x, y, align, wide, tall) }));
       const spot = places.find(({ box }) => this.#free(box, this.placed) && this.#free(box, this.lines)) ?? (one.rank === NAME && places.find(({ box }) => this.#free(box, this.placed)));

@@ -7,18 +7,12 @@ const NEAR = 60;
 
 export class Log {
   constructor(root, states, radio, go) {
-    this.root = root;
-    this.states = states;
-    this.radio = radio;
-    this.go = go;
+    Object.assign(this, { root, states, radio, go });
     for (const box of [states, radio]) box.addEventListener("change", () => { this.dirty = true; this.onchange?.(); });
   }
 
   stage(store) {
-    this.store = store;
-    this.events = [];
-    this.read = 0;
-    this.dirty = true;
+    Object.assign(this, { store, events: [], read: 0, dirty: true });
   }
 
   #read() {
@@ -75,10 +69,7 @@ export class Log {
       const top = current.offsetTop - this.root.offsetTop;
       this.root.scrollTop = Math.max(0, top - this.root.clientHeight + current.offsetHeight + 30);
     }
-    this.dirty = false;
-    this.tick = tick;
-    this.focus = focus;
-    this.truth = truth;
+    Object.assign(this, { dirty: false, tick, focus, truth });
   }
 
   #items = new WeakMap();

@@ -14,6 +14,7 @@ import { Guide } from "./guide.js";
 import { Legend } from "./legend.js";
 import { Log } from "./log.js";
 import { list_missions, state_of } from "./missions.js";
+import { unit } from "./pen.js";
 import { Plane } from "./plane.js";
 import { same, Tip, written } from "./selection.js";
 import { activities, Announcer, described } from "./spoken.js";
@@ -43,10 +44,7 @@ const view = {
   /** True if the ground truth is shown; always false if the run has none. */
   get truth() { return this.wanted && (store?.has_truth ?? true); },
 };
-let listed = null;
-let source = null;
-let due = false;
-let before = null;
+let listed = null, source = null, due = false, before = null;
 
 const guide = new Guide();
 const announcer = new Announcer();
@@ -249,11 +247,7 @@ function play(on = !view.playing) {
   if (!store) return;
   if (on && view.tick >= store.last && !store.live) view.tick = store.first;
   if (on && view.guided && !plane.freed) plane.following = true;
-  view.playing = on;
-  view.follow = false;
-  view.share = 0;
-  view.beat = null;
-  view.held = 0;
+  Object.assign(view, { playing: on, follow: false, share: 0, beat: null, held: 0 });
   before = null;
   draw();
 }
@@ -270,11 +264,7 @@ function advance(now) {
   }
   const time = view.tick + view.share + s * view.speed;
   if (time >= store.last) {
-    view.tick = store.last;
-    view.share = 0;
-    view.playing = false;
-    view.follow = store.live;
-    return;
+    return void Object.assign(view, { tick: store.last, share: 0, playing: false, follow: store.live });
   }
   const tick = Math.floor(time);
   if (!store.scene(tick)) {
@@ -316,7 +306,7 @@ function draw() {
     tell_state({ shown: store.scene(view.tick) ? view.tick : null, first: store.first, last: store.last });
     plane.draw(store, view);
     const size = [$("canvas").clientWidth, $("canvas").clientHeight];
-    tip.draw({ ...view, store }, plane.hovered ?? plane.targets.find((one) => same(one, view.selected)), size, plane.unit);
+    tip.draw({ ...view, store }, plane.hovered ?? plane.targets.find((one) => same(one, view.selected)), size, unit());
     timeline.draw(view, activities(store, view));
     legend.draw(store.grouped ? group_marks(plane.marks, store.stage.team) : plane.marks, timeline.kinds, legend_names());
     sequence.draw(store, view);
@@ -364,9 +354,9 @@ function controls() {
   hide($("notes"), !notes);
   const subject = view.focus ?? "each robot";
   const bearing = store.stage.team || knows_bearing() ? "" : "; the bearing from the anchor is arbitrary until the robot is placed in the world";
-  const only = store.has_truth ? `only the belief of ${subject}` : `no ground truth: only the belief of ${subject}`;
+  const only = `${store.has_truth ? "" : "no ground truth: "}only the posterior of ${subject}`;
   const unknown = store.scene(view.tick)?.players.every((player) => !player.pose) ? "the ground truth of this tick is unknown" : "";
-  text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the belief of ${subject}` : ""));
+  text($("seen"), !view.truth ? `${only}${bearing}` : unknown || (view.focus ? `ground truth and the posterior of ${subject}` : ""));
   attribute($("canvas"), "aria-label", described(store, view));
 }
 

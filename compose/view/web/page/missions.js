@@ -1,8 +1,9 @@
 // The list of missions, if the server has several, and the state of a mission in a few words.
 
 import { make } from "./cards.js";
-import { outcome_chip } from "./outcome.js";
 import { plural } from "./words.js";
+
+const SIGNS = { localised: "★", undecided: "?", inconsistent: "≠", wrong: "✕", failed: "!" };
 
 /** Fills `root` with the missions of a server's list. */
 export function list_missions(root, { shows, network }) {
@@ -26,4 +27,11 @@ export function state_of(live, last, end) {
   if (end) return `${end.outcome} after ${end.tick} ticks`;
   if (live) return `● running, tick ${Math.max(last, 0)}`;
   return `incomplete, ends at tick ${last}`;
+}
+
+/** Returns the state of a mission, with a sign if it has an outcome. */
+function outcome_chip(outcome, state) {
+  const chip = make("span", { className: "chip outcome", textContent: `${SIGNS[outcome] ? `${SIGNS[outcome]} ` : ""}${state}` });
+  if (outcome) chip.dataset.result = outcome;
+  return chip;
 }

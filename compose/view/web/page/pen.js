@@ -32,9 +32,9 @@ export const OUTLINED = [3, 2.2];
 export function stroked(pen, colour, width, dash = []) {
   pen.strokeStyle = colour;
   pen.lineWidth = width;
-  pen.setLineDash(dash);
+  if (dash.length) pen.setLineDash(dash);
   pen.stroke();
-  pen.setLineDash([]);
+  if (dash.length) pen.setLineDash([]);
 }
 
 /** Draws a line through `points`, in pixels. */
@@ -68,7 +68,9 @@ export function outlined(pen, role, [x, y], heading, size, colour, width, dash =
 /** Draws a cross over a robot. */
 export function cross(pen, x, y, size, look) {
   const r = 0.7 * size;
-  for (const side of [-r, r]) line(pen, [[x - r, y - side], [x + r, y + side]], look.fault, 2);
+  pen.beginPath();
+  for (const side of [-r, r]) { pen.moveTo(x - r, y - side); pen.lineTo(x + r, y + side); }
+  stroked(pen, look.fault, 2);
 }
 
 export class Look {

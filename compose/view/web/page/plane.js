@@ -1,4 +1,4 @@
-// The plane in one tick: anchors, trails, robots, ranges, reports and beliefs.
+// The plane in one tick: anchors, trails, robots, ranges, reports and posteriors.
 
 import { Backdrop } from "./backdrop.js";
 import { Beliefs } from "./beliefs.js";
@@ -8,12 +8,13 @@ import { scenario_discs, story_discs, true_and_reported } from "./camera.js";
 import { distance, TAU } from "./geometry.js";
 import { heads, links } from "./group.js";
 import { Labels, NAME } from "./labels.js";
+import { Layer } from "./layer.js";
 import { cross, dot, line, Look, OUTLINED, outlined, shape, stroked, unit } from "./pen.js";
 import { palette } from "./strip.js";
 import { same, under } from "./selection.js";
 import { Signals } from "./signals.js";
 import { Tints } from "./tints.js";
-import { LEAST_GAP_M, pose_now, REPORTED, Trails, TRUE } from "./trails.js";
+import { LEAST_GAP_M, pose_now, REPORTED, stands, Trails, TRUE } from "./trails.js";
 import { metres } from "./words.js";
 
 /** The time in s in which the camera covers most of the way to where it is needed. */
@@ -26,12 +27,16 @@ const CAPTION_PX = 92, CAPTION_SHARE = 0.3, CLEAR_PX = 12;
 const DRAG_PX = 4;
 const VISIBLE_PX = 2; // the sensing range from which on poses and measurements can be told from the robots
 const ALL_DRAWN = 8; // robots that are all drawn, also those that are out of view
+/** Robots in view from which on those that stand are a layer, and the part by which that is scaled at most while the camera eases. */
+const LAYERED = 80, STANDING_ZOOMED = 0.06;
 /** The least width and height in pixels of a picture: a lower window shows a part of it. */
 const LEAST_PX = 40;
 /** The sides of the small map of a group as shares of the plane's, and the least zoom of the camera with which it is drawn. */
 const INSET = 0.2, ZOOMED = 2.5;
 /** The largest number of robots of a group that always have their names; those of one pair have them, too. */
 const NAMED = 20;
+/** The texts over the plane. */
+const OVER = [...document.querySelectorAll("#stage :is(p, ul), #legend :is(summary, ul)")];
 
 /** The map from the world to the canvas, with pan and zoom, and the order in which things are drawn. */
 export class Plane {
@@ -52,6 +57,7 @@ export class Plane {
     this.#redraw = redraw;
     this.#trails = new Trails(this);
     this.#backdrop = new Backdrop(this, this.#trails);
+    this.#standing = new Layer(this, STANDING_ZOOMED);
     this.#beliefs = new Beliefs(this);
     this.#signals = new Signals(this);
     this.#configurations = new Configurations(this);
@@ -93,6 +99,7 @@ export class Plane {
   #redraw;
   #trails;
   #backdrop;
+  #standing;
   #size = [0, 0];
   #beliefs;
   #signals;
@@ -121,7 +128,6 @@ export class Plane {
   }
 
   get width() { return this.#size[0]; }
-  get unit() { return unit(); }
   get height() { return this.#size[1]; }
 
   /** Reads the size of the canvas, which the browser may have to compute. */
@@ -229,12 +235,12 @@ export class Plane {
     return least[0] <= x + wide && most[0] >= x - wide && least[1] <= y + tall && most[1] >= y - tall;
   }
 
-  /** Calls `draw` while the plane is larger by `pad` pixels on each side. */
-  padded(pad, draw) {
-    const size = this.#size;
-    this.#size = size.map((one) => one + 2 * pad);
+  /** Calls `draw` while all is drawn with `pen`, on a plane that is larger by `pad` pixels on each side. */
+  padded(pad, pen, draw) {
+    const { context } = this, size = this.#size;
+    [this.context, this.#size] = [pen, size.map((one) => one + 2 * pad)];
     draw();
-    this.#size = size;
+    [this.context, this.#size] = [context, size];
   }
 
   /** The parts of a metre that are at most a pixel long: a power of two. */
@@ -261,15 +267,16 @@ export class Plane {
     pen.clearRect(0, 0, this.width, this.height);
     pen.lineCap = pen.lineJoin = "round";
     pen.font = look.font;
-    const view = { store, tick, share, focus, truth, moving, eliminated, planned, turned, look, scene: store.scene(tick) };
+    const view = { store, tick, share, focus, truth, moving, eliminated, planned, turned, look, ratio, scene: store.scene(tick) };
+    view.known = [store.name, store.revision, store.last, Math.min(store.whole, tick + 1), Boolean(view.scene), tick, focus, truth, width, height, ratio, look.paper].join();
     this.labels = new Labels(pen, look, this.width, this.height, this.#overlays());
     const shown = (robot) => truth || !focus || robot.id === focus;
     const all = store.stage.robots.filter(shown), robots = view.scene && all.length > ALL_DRAWN ? this.#in_view(view, all) : all;
-    this.#backdrop.draw(view, all, robots, ratio);
+    this.#backdrop.draw(view, all, robots);
     const near = store.stage.mission.sensing_range * this.scale < VISIBLE_PX ? [] : robots;
-    if (truth) this.#trails.newest(pen, view, near);
-    for (const robot of near) this.#trails[truth ? "turned" : "believed_trail"](pen, view, robot);
-    if (view.scene) this.#scene(view, robots);
+    if (truth) this.#trails.newest(view, near);
+    for (const robot of near) this.#trails[truth ? "turned" : "believed_trail"](view, robot);
+    if (view.scene) this.#scene(view, all, robots);
     else this.#backdrop.beacons(view, robots);
     this.#ring(this.targets.find((one) => same(one, selected)), look);
     const cursor = this.hovered ? "pointer" : "";
@@ -305,15 +312,11 @@ export class Plane {
   /** Returns the size in pixels with which robots are drawn. */
   robot_size(store) { return Math.max(4.5, Math.min(11, 0.18 * store.stage.mission.sensing_range * this.scale)); }
 
-  #scene(view, robots) {
+  #scene(view, all, robots) {
     const { store, truth, focus } = view;
     view.size = this.robot_size(store);
-    view.places = new Map((store.grouped ? store.stage.robots : robots).map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
-    if (store.stage.mission.sensing_range * this.scale < VISIBLE_PX) {
-      this.#backdrop.beacons(view, robots);
-      for (const robot of truth ? robots : []) this.#robot(view, robot, view.places.get(robot.id));
-      return;
-    }
+    view.places = new Map(all.map((robot) => [robot.id, pose_now(view, robot, TRUE)]));
+    if (store.stage.mission.sensing_range * this.scale < VISIBLE_PX) return void this.#foreground(view, all, robots);
     for (const robot of robots) if (!focus || robot.id === focus) this.#construction.mirror(view, robot);
     view.passed = new Map();
     for (const robot of robots.filter(({ role }) => role === "a")) {
@@ -328,10 +331,19 @@ export class Plane {
     if (truth) for (const [robot, peer] of pairs) this.#signals.contact(view, robot, peer);
     if (!truth) for (const robot of robots) this.#signals.mutual_ring(view, robot);
     if (truth) for (const robot of robots) this.#reported(view, robot);
-    this.#backdrop.beacons(view, robots);
     for (const robot of robots) if (robot.role === "a") this.#configurations.manoeuvre(view, robot);
-    if (truth) for (const robot of robots) this.#robot(view, robot, view.places.get(robot.id));
+    this.#foreground(view, all, robots);
     if (truth && store.stage.visits?.length) this.#inset(view);
+  }
+
+  /** Draws anchors and robots; of many, all anchors and the robots that stand are a layer. */
+  #foreground(view, all, robots) {
+    const many = robots.length > LAYERED, shown = view.truth ? robots : [], standing = new Set(many && view.truth ? all.filter((robot) => stands(view, robot)) : []);
+    const drawn = () => { this.#backdrop.beacons(view, many ? all : robots); for (const robot of standing) this.#robot(view, robot); };
+    if (many) this.#standing.show([view.known, view.moving, standing.size].join(), view.ratio, drawn);
+    else drawn();
+    for (const robot of shown) if (!standing.has(robot)) this.#robot(view, robot);
+    for (const robot of shown) this.#name(view, robot);
   }
 
   /** Draws a small map of a group in a corner, with a frame around what is in view, unless most is. */
@@ -360,7 +372,7 @@ export class Plane {
     if (!pose || !true_pose || distance(pose, true_pose) < LEAST_GAP_M) return;
     const [x, y] = this.at(pose), [to_x, to_y] = this.at(true_pose);
     this.marks.add("reported");
-    pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
+    pen.globalAlpha = alpha_of(robot, focus);
     line(pen, [[x, y], [to_x, to_y]], look.fault, 1);
     shape(pen, robot.role, x, y, pose[2], size);
     pen.fillStyle = look.paper;
@@ -377,31 +389,41 @@ export class Plane {
   /** Returns the boxes of the texts over the plane, as [left, top, right, bottom]. */
   #overlays() {
     const { left, top } = this.canvas.getBoundingClientRect(), scale = unit();
-    return [...document.querySelectorAll("#stage :is(p, ul), #legend summary, #legend[open] ul")].filter((one) => one.textContent && !one.hidden).map((one) => {
-      const box = one.getBoundingClientRect();
-      return [(box.left - left) / scale, (box.top - top) / scale, (box.right - left) / scale, (box.bottom - top) / scale];
-    });
+    const seen = OVER.filter((one) => one.firstChild && !one.hidden && (one.tagName !== "UL" || one.parentElement.open !== false));
+    return seen.map((one) => one.getBoundingClientRect()).map((box) => [box.left - left, box.top - top, box.right - left, box.bottom - top].map((side) => side / scale));
   }
 
   // --- robots ---
 
-  #robot({ look, size, focus, scene, store }, robot, pose) {
+  #robot({ look, size, focus, scene, store, places }, robot) {
+    const pose = places.get(robot.id);
     if (!pose) return;
-    const pen = this.context, [x, y] = this.at(pose);
-    const down = scene.players[store.places.get(robot.id)]?.down;
-    pen.globalAlpha = focus && robot.id !== focus && robot.peer !== focus ? 0.45 : 1;
+    const pen = this.context, [x, y] = this.at(pose), { down } = scene.players[store.places.get(robot.id)];
+    pen.globalAlpha = alpha_of(robot, focus);
     outlined(pen, robot.role, [x, y], pose[2], size, look.paper, size > 6 ? 4.5 : 3);
     pen.fillStyle = down ? look.paper : look.robot[robot.role];
     pen.fill();
-    outlined(pen, robot.role, [x, y], pose[2], size, down ? look.robot[robot.role] : look.ink, down ? 3 : size > 6 ? 1.6 : 1);
+    stroked(pen, down ? look.robot[robot.role] : look.ink, down ? 3 : size > 6 ? 1.6 : 1);
     if (down) cross(pen, x, y, size, look);
+    pen.globalAlpha = 1;
+  }
+
+  /** Asks for the label of a robot, and adds its target. */
+  #name({ look, size, focus, scene, store, places }, robot) {
+    const pose = places.get(robot.id);
+    if (!pose) return;
+    const [x, y] = this.at(pose), { down } = scene.players[store.places.get(robot.id)];
     this.marks.add(down ? "down" : `robot-${robot.role}`);
     this.targets.push({ kind: "robot", robot: robot.id, at: [x, y], radius: size });
     if (size > 6) this.labels.placed.push([x - size, y - size, x + size, y + size]);
     if (size > 6 || down || robot.id === focus || store.places.size <= (store.grouped ? NAMED : 2)) {
+      this.context.globalAlpha = alpha_of(robot, focus);
       const name = down ? `${robot.id} is down` : robot.id;
       this.labels.put(name, x + size + 4, y - size - 2, look.ink, "left", { font: look.bold, rank: NAME, around: size + 4 });
+      this.context.globalAlpha = 1;
     }
-    pen.globalAlpha = 1;
   }
 }
+
+/** Returns the opacity of a robot: those that do not meet the selected one are pale. */
+const alpha_of = ({ id, peer }, focus) => (focus && id !== focus && peer !== focus ? 0.45 : 1);

@@ -21,9 +21,7 @@ function strip({ reachable, separation_m2 }, omega) {
 
 export class Predictions {
   constructor(root, plane) {
-    this.root = root;
-    this.plane = plane;
-    this.key = "";
+    Object.assign(this, { root, plane, key: "" });
   }
 
   /** Shows those of `pair`, a robot of role a and its peer. */

@@ -53,9 +53,8 @@ export class Sequence {
     pen.rect(this.inset, 0, room, tall); // an arrow may begin before the first tick that is shown
     pen.clip();
     this.#lanes(frame);
-    this.#numbers(frame);
     this.#arrows(frame);
-    this.#processes(frame);
+    this.#ticks(frame);
     const hidden = store.stage.robots.length - robots.length;
     const text = `Tick ${tick}. ${told(store, tick, rows).join(". ") || "No reports"}.${hidden ? ` ${plural(hidden, "robot")} not shown.` : ""}`;
     if (this.told.textContent !== text) {
@@ -84,13 +83,6 @@ export class Sequence {
     }
   }
 
-  #numbers({ pen, of, x, tick, to }) {
-    for (let k = this.from; k <= to; k++) {
-      pen.fillStyle = of(k === tick ? "ink" : "faint");
-      pen.fillText(String(k), x(k), 12);
-    }
-  }
-
   #arrows({ pen, store, of, rows, x, to }) {
     const side = 0.2 * TICK;
     for (let k = this.from; k <= to; k++) {
@@ -102,9 +94,11 @@ export class Sequence {
     }
   }
 
-  /** Draws ends and restarts of processes, and missed deadlines. */
-  #processes({ pen, store, of, rows, x, to }) {
+  /** Draws the numbers of ticks, ends and restarts of processes, and missed deadlines. */
+  #ticks({ pen, store, of, rows, x, tick, to }) {
     for (let k = this.from; k <= to; k++) {
+      pen.fillStyle = of(k === tick ? "ink" : "faint");
+      pen.fillText(String(k), x(k), 12);
       for (const { kind, robot } of store.scene(k)?.events ?? []) {
         const y = rows.get(robot);
         if (!PROCESS.has(kind) || y === undefined) continue;

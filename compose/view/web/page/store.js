@@ -5,16 +5,9 @@ import * as data from "./data.js";
 
 export class Store {
   constructor(name, mission, changed) {
-    this.name = name;
-    this.stage = mission.stage;
+    Object.assign(this, { name, stage: mission.stage, state: mission, version: mission.version, onforget: () => {} });
+    Object.assign(this, { scenes: [], wanted: 0, closed: false, revision: 0 });
     this.places = new Map(mission.stage.robots.map((robot, place) => [robot.id, place]));
-    this.scenes = [];
-    this.state = mission;
-    this.version = mission.version;
-    this.wanted = 0;
-    this.closed = false;
-    this.revision = 0;
-    this.onforget = () => {};
     this.#changed = changed;
     this.#fill();
   }
@@ -53,23 +46,22 @@ export class Store {
 
   player(tick, robot) { return this.scenes[tick]?.players[this.places.get(robot)]; }
 
-  /** Returns the phase of the robot's latest command up to `tick`; 1 if there is none. */
-  phase(tick, robot) {
+  /** Returns the robot's latest command up to `tick`; undefined if there is none. */
+  #command(tick, robot) {
     for (let k = tick; k >= this.first; k--) {
       const command = this.player(k, robot)?.command;
-      if (command) return command.phase;
+      if (command) return command;
     }
-    return 1;
+    return undefined;
   }
+
+  /** Returns the phase of the robot's latest command up to `tick`; 1 if there is none. */
+  phase(tick, robot) { return this.#command(tick, robot)?.phase ?? 1; }
 
   /** Returns the role of a robot, and in a group "a" once it is localised and "b" before: the hue of what is drawn. */
   role(tick, robot) {
     if (!this.grouped) return this.stage.robots[this.places.get(robot)].role;
-    for (let k = tick; k >= this.first; k--) {
-      const command = this.player(k, robot)?.command;
-      if (command) return command.verdict?.[0] === "localised" ? "a" : "b";
-    }
-    return "b";
+    return this.#command(tick, robot)?.verdict?.[0] === "localised" ? "a" : "b";
   }
 
   /** Gives the robots of a group the role and the peer that they have in `tick`. */

@@ -13,9 +13,7 @@ const SIGN = 11;
 
 export class Timeline {
   constructor(box, canvas, scrub, go) {
-    this.canvas = canvas;
-    this.scrub = scrub;
-    this.box = box;
+    Object.assign(this, { box, canvas, scrub });
     dragged(box, (event, began) => {
       const { left, width } = canvas.getBoundingClientRect(), inset = this.inset * unit();
       const share = (event.clientX - left - inset) / Math.max(width - inset - 6, 1);

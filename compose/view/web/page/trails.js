@@ -34,6 +34,12 @@ export function pose_now({ store, tick, share, moving }, robot, kind) {
   return between(pose, kind.pose(next), kind.driven(here, next, period), share, period);
 }
 
+/** Returns whether `robot` stays where it is until the next tick. */
+export function stands({ store, tick, moving }, robot) {
+  const here = TRUE.pose(store.player(tick, robot.id)), next = moving && TRUE.pose(store.player(tick + 1, robot.id));
+  return !here || !next || next.every((one, i) => one === here[i]);
+}
+
 /** Returns the trails of a robot that are known with the truth. */
 const kinds_of = (robot) => (robot.attack ? [TRUE, REPORTED] : [TRUE]);
 
@@ -62,10 +68,10 @@ export class Trails {
   }
 
   /** Draws the trails of `styles`, as far as they are in view: many short paths are drawn in less time than a long one. */
-  trails(pen, view, styles) {
+  trails(view, styles) {
     for (const { robot, kind, strength, phase, role, pieces } of styles) {
       const paths = pieces.filter(({ least, most }) => this.plane.sees(least, most)).map(({ path }) => path);
-      this.#stroked(pen, view, robot, kind, (stroke) => stroke({ paths, phase, role }, strength));
+      this.#stroked(view, robot, kind, (stroke) => stroke({ paths, phase, role }, strength));
     }
   }
 
@@ -74,8 +80,8 @@ export class Trails {
    *
    * They are there until it meets its peer; in the tick with the caption about its path, with copies of the path.
    */
-  turned(pen, view, robot) {
-    const { store, tick, scene, look, share, moving } = view, player = store.player(tick, robot.id), held = player?.held;
+  turned(view, robot) {
+    const pen = this.plane.context, { store, tick, scene, look, share, moving } = view, player = store.player(tick, robot.id), held = player?.held;
     const told = scene?.captions?.some(({ kind, robots }) => kind === "path" && robots.includes(robot.id));
     const pose = pose_now(view, robot, TRUE), size = this.plane.robot_size(store);
     if (!pose || !held?.local.length || held.world.length) return;
@@ -87,7 +93,7 @@ export class Trails {
     const turns = alpha > 0 ? TURNS : LATER_TURNS;
     for (let i = 1; i < turns; i++) {
       const angle = (i * TAU) / turns, turn = compose([x, y, angle], [-x, -y, 0]);
-      this.#stroked(pen, view, robot, TRUE, (stroke) => {
+      this.#stroked(view, robot, TRUE, (stroke) => {
         pen.globalAlpha = 0.35 * alpha;
         pen.transform(Math.cos(angle), Math.sin(angle), -Math.sin(angle), Math.cos(angle), turn[0], turn[1]);
         for (const piece of pieces) stroke(piece);
@@ -100,7 +106,7 @@ export class Trails {
   }
 
   /** Draws the parts of trails that `robots` have driven since the tick. */
-  newest(pen, view, robots) {
+  newest(view, robots) {
     const styles = new Map(), { store, focus } = view;
     for (const robot of view.moving && view.share > 0 ? robots : []) for (const kind of kinds_of(robot)) {
       const path = this.#driven(view, robot, kind), phase = store.phase(view.tick, robot.id), { role } = robot;
@@ -108,7 +114,7 @@ export class Trails {
       if (!styles.has(key)) styles.set(key, { robot, kind, phase, role, paths: [] });
       if (path) styles.get(key).paths.push(path);
     }
-    for (const { robot, kind, ...style } of styles.values()) if (style.paths.length) this.#stroked(pen, view, robot, kind, (stroke) => stroke(style));
+    for (const { robot, kind, ...style } of styles.values()) if (style.paths.length) this.#stroked(view, robot, kind, (stroke) => stroke(style));
   }
 
   /** Returns the path of `robot` since the tick; undefined if there is none. */
@@ -126,8 +132,8 @@ export class Trails {
   }
 
   /** Calls `draw` with a function that strokes a piece of a trail, whose path is in m, in the style of its phase. */
-  #stroked(pen, { look, focus }, robot, kind, draw) {
-    const faint = focus && robot.id !== focus;
+  #stroked({ look, focus }, robot, kind, draw) {
+    const pen = this.plane.context, faint = focus && robot.id !== focus;
     const ratio = (window.devicePixelRatio || 1) * unit(), { scale: s, width: wide, height, centre } = this.plane;
     pen.save();
     pen.globalAlpha = faint ? 0.4 : 0.95;
@@ -180,12 +186,13 @@ export class Trails {
       for (let bend = 1; bend < bends; bend++) to_pose(between(start, end, driven, bend / bends, period));
       to_pose(end);
     }
-    if (complete) this.#chunks.set(key, pieces);
-    return pieces;
+    const found = pieces.filter(({ least, most }) => least.some((one, i) => one !== most[i])); // a robot that stands leaves no path
+    if (complete) this.#chunks.set(key, found);
+    return found;
   }
 
   /** Draws the trail implied by the most probable current pose, or one per pose if none leads. */
-  believed_trail(_pen, view, robot) {
+  believed_trail(view, robot) {
     const { store, tick, share, moving } = view, now = store.player(tick, robot.id)?.held;
     if (!now?.local.length) return;
     const here = held_now({ ...view, moving: false }, robot).poses, there = held_now(view, robot).poses;
