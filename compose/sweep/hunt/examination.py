@@ -16,12 +16,10 @@ from compose.launch import in_process, virtual_hardware, virtual_processes
 from compose.recording.run import Run, of_frames
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
-from compose.sweep.hunt.invariants import Breach, bounded, breaches, guaranteed
+from compose.sweep.hunt.invariants import Breach, breaches, guaranteed
 from compose.sweep.hunt.mutation import Clues
 from compose.sweep.hunt.reached_states import (
     DISTURBED,
-    REPEATED_EACH,
-    DecisionDiffersError,
     TooLongError,
     WatchedPlanner,
     reached,
@@ -51,8 +49,6 @@ class Examined(msgspec.Struct, frozen=True):
     breaches: tuple[Breach, ...] = ()
     reached: frozenset[str] = frozenset()
     known: Clues = Clues(())
-    bound_shares: tuple[float, ...] = ()
-    """The time of each thing with a computed bound, relative to that."""
     refused: str | None = None
     """The reason why the input was not run; None if it was."""
 
@@ -78,8 +74,6 @@ def examined(table: dict[str, Any], seen: Set[str] | None = None) -> Examined:
     conditions: set[str] = set()
     try:
         sinks, messages, is_cut = watched(scenario, conditions)
-    except DecisionDiffersError as error:
-        return Examined((Breach("a decision differs", str(error)),))
     except Exception as error:  # noqa: BLE001  # no input may make a planner or the world raise anything
         return Examined((Breach("a process dies", f"{type(error).__name__}: {error}"),))
     again: list[Breach] = []
@@ -104,8 +98,7 @@ def examined(table: dict[str, Any], seen: Set[str] | None = None) -> Examined:
     except Exception as error:  # noqa: BLE001  # nor a reader of the recording, or a rule of the audit
         return Examined((*again, Breach("the recording is misread", f"{type(error).__name__}: {error}")))
     ids = tuple([one.id for one in scenario.robots])
-    shares = tuple([one.ticks / one.bound for one in bounded(run) if one.ticks is not None])
-    return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments), shares)
+    return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments))
 
 
 def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal], EncodedMessages, bool]:
@@ -114,13 +107,12 @@ def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal
     It is cut after MOST_WITHOUT_END ticks if nothing must end it. `seen` are the conditions not met.
     """
     last = math.inf if guaranteed(scenario) else MOST_WITHOUT_END
-    first = scenario.seed % REPEATED_EACH
     sinks, messages = {name: MemoryJournal() for name in in_process.journals(scenario)}, EncodedMessages()
     try:
         in_process.played(
             scenario,
             sinks,
-            lambda config: cast(Any, WatchedPlanner(config, seen, last, first)),
+            lambda config: cast(Any, WatchedPlanner(config, seen, last)),
             messages.encode,
         )
     except TooLongError:
