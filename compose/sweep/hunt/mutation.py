@@ -303,6 +303,15 @@ def _anchor(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     return table
 
 
+def _less(table: Table, _known: Clues, draw: random.Random) -> Table | None:
+    """Leave out some of the faults, kills and clocks."""
+    lists = [name for name in LISTS if table.get(name)]
+    if not lists:
+        return None
+    name = draw.choice(lists)
+    return {**table, name: draw.sample(table[name], draw.randrange(len(table[name])))}
+
+
 IN_TURN_SHARE = 0.3
 """The share of kills that are those of one process at one point of consecutive ticks."""
 
@@ -322,6 +331,7 @@ MUTATIONS: Mapping[Change, float] = {
     _names: 0.7,
     _setting: 1.5,
     _anchor: 0.5,
+    _less: 1.5,
 }
 """The changes of an input, and how often each is drawn."""
 
