@@ -16,7 +16,7 @@ from compose.launch import in_process, virtual_hardware, virtual_processes
 from compose.recording.run import Run, of_frames
 from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
-from compose.sweep.hunt.invariants import Breach, breaches, guaranteed
+from compose.sweep.hunt.invariants import Breach, bounds, breaches, guaranteed
 from compose.sweep.hunt.mutation import Clues
 from compose.sweep.hunt.reached_states import (
     DISTURBED,
@@ -41,6 +41,8 @@ FULL_EACH = 32
 
 A run as virtual processes with kills takes the time of ten missions with exact sensors.
 """
+BOUND_PARTS = 50
+"""The parts of a computed bound: a run that takes a part that none took before has reached a new state."""
 
 
 class Examined(msgspec.Struct, frozen=True):
@@ -87,6 +89,10 @@ def examined(table: dict[str, Any], seen: Set[str] | None = None) -> Examined:
             f"clock: {alone} {who == 'world'} {sorted({by for _, by in one.jumps})}"
             for who, one in clocks.items()
         }
+        parts = [(ticks, bound) for _, ticks, bound in bounds(run) if ticks is not None and bound]
+        near = {
+            f"{i} of {len(parts)} bounds: {BOUND_PARTS * one[0] // one[1]}" for i, one in enumerate(parts)
+        }
         found |= conditions | events
         known = seen or frozenset()
         in_turn = seen is None or crc32(msgspec.json.encode(table)) % FULL_EACH == 0
@@ -98,7 +104,7 @@ def examined(table: dict[str, Any], seen: Set[str] | None = None) -> Examined:
     except Exception as error:  # noqa: BLE001  # nor a reader of the recording, or a rule of the audit
         return Examined((*again, Breach("the recording is misread", f"{type(error).__name__}: {error}")))
     ids = tuple([one.id for one in scenario.robots])
-    return Examined(tuple(every), frozenset(found), Clues(ids, run.length - 1, moments))
+    return Examined(tuple(every), frozenset(found | near), Clues(ids, run.length - 1, moments))
 
 
 def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal], EncodedMessages, bool]:

@@ -93,18 +93,26 @@ def unfinished(run: Run) -> Iterator[Breach]:
         yield Breach("unfinished", f"tick {run.end.tick}: {run.end.outcome}: {run.end.causes}")
 
 
-def late(run: Run) -> Iterator[Breach]:
-    """The computed bounds hold: of the meeting of a pair, or of each robot that a group localises."""
+def bounds(run: Run) -> list[tuple[str, int | None, int]]:
+    """Return what has a bound in `run`, the ticks that it took, None if it did not happen, and the bound.
+
+    It is the meeting of a pair, or each robot that a group localises.
+    """
     scenario = run.scenario
     if not guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
-        return
-    bounds = [(one.visited, one.localised_tick, one.bound_ticks) for one in meeting_results(run)]
-    bounds += [(one.robot, one.localised_tick, one.bound_ticks) for one in search_results(run)]
+        return []
+    found = [(one.visited, one.localised_tick, one.bound_ticks) for one in meeting_results(run)]
+    found += [(one.robot, one.localised_tick, one.bound_ticks) for one in search_results(run)]
     if scenario.in_pairs:
-        found = row(Trial(0, 0, scenario, processes=False), run, 0.0)
-        if found.meeting_tick is not None and found.orbiting_tick is not None:
-            bounds.append(("meeting", found.meeting_tick - found.orbiting_tick, found.t_max_ticks or 0))
-    for what, ticks, bound in bounds:
+        pair = row(Trial(0, 0, scenario, processes=False), run, 0.0)
+        if pair.meeting_tick is not None and pair.orbiting_tick is not None:
+            found.append(("meeting", pair.meeting_tick - pair.orbiting_tick, pair.t_max_ticks or 0))
+    return found
+
+
+def late(run: Run) -> Iterator[Breach]:
+    """The computed bounds hold."""
+    for what, ticks, bound in bounds(run):
         if ticks is None or ticks > bound:
             yield Breach("bound", f"{what}: {ticks} ticks, bound {bound}")
 
