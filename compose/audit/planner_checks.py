@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
-from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Any
 
 from agent.planning.planner import Planner
 from compose.audit.planner_probe import BreaksContract, HostilityProbe, PurityProbe, Watched
 from compose.audit.rules import audit_run
 from compose.errors import PlannerFailed, UserError
-from compose.launch import in_process, planner_loader, processes
+from compose.launch import in_process, planner_loader
 from compose.launch.supervisor import ChildFailed
 from compose.recording import run as recorded
 from compose.recording.comparison import comparison
@@ -19,15 +17,12 @@ from compose.recording.reasons import reason_for
 from compose.recording.recording_files import WORLD_JOURNAL
 from compose.recording.run import Run
 from compose.scenario.kills import KILL_POINTS, Kill, parse
-from compose.scenario.run_settings import run_name
+from compose.sweep.trial_mission import as_processes
 from compose.terminal.finding import Finding, checked, ok
-from protocol.journal.journal_file import MemoryJournal, packed
+from protocol.journal.journal_file import MemoryJournal
 from protocol.messages import RobotConfig
 from protocol.network.inbox import Inbox
 from world.scenario import Scenario
-
-CHECK_TIMEOUT_S = 30.0
-"""The time in s without an answer after which a run as processes has failed."""
 
 
 class QuietInbox(Inbox):
@@ -64,7 +59,7 @@ def check_planner(scenario: Scenario, inbox: Inbox) -> Iterator[Finding]:
         ("it decides the same as processes over the network", ()),
         ("killed processes resume and decide the same", _kills(scenario, run)),
     ):
-        yield checked(rule, _as_processes(scenario, first, kills, inbox))
+        yield checked(rule, _as_processes(scenario, kills, inbox))
 
 
 def _journals(
@@ -139,27 +134,14 @@ def _contact(run: Run, name: str) -> set[int]:
     return {tick for tick in range(run.length) if run.contact(name, tick) is not None}
 
 
-def _as_processes(scenario: Scenario, first: Journals, kills: tuple[Kill, ...], inbox: Inbox) -> str | None:
-    """Return how a run as processes differs from the one in this process; None if it does not."""
-    with TemporaryDirectory(prefix="tandem-check-") as folder:
-        try:
-            spared = processes.run_mission(
-                scenario,
-                Path(folder),
-                inbox,
-                run=run_name(scenario),
-                rate=None,
-                timeout=CHECK_TIMEOUT_S,
-                kills=kills,
-            )
-        except ChildFailed as error:
-            return str(error)
-        if len(spared) == len(kills) and kills:
-            return "no kill took place"
-        for name, frames in first.items():
-            if (Path(folder) / name).read_bytes() != packed(frames):
-                end = recorded.read(Path(folder)).end
-                if end is not None and end.outcome == "failed":
-                    return f"the mission failed: {reason_for(end)}"
-                return f"{name} has other bytes"
-    return None
+def _as_processes(scenario: Scenario, kills: tuple[Kill, ...], inbox: Inbox) -> str | None:
+    """Return how a run as processes differs from one in this process; None if it does not."""
+    try:
+        ran = as_processes(scenario, audit=False, kills=kills, inbox=inbox)
+    except ChildFailed as error:
+        return str(error)
+    if kills and not ran.kills:
+        return "no kill took place"
+    if ran.differing and ran.run.end is not None and ran.run.end.outcome == "failed":
+        return f"the mission failed: {reason_for(ran.run.end)}"
+    return f"{ran.differing[0]} has other bytes" if ran.differing else None

@@ -66,7 +66,7 @@ def _say_reached(hunt: Hunt, scenario: str, seconds: float) -> None:
         f"{hunt.refused} inputs are no mission, or last too long; "
         f"{len(hunt.seen)} states and transitions reached"
     )
-    for kind, names in never(hunt.seen.keys()).items():
+    for kind, names in never(hunt.seen).items():
         if names:
             tell(f"never reached, {kind}: {', '.join(names)}")
 

@@ -54,8 +54,10 @@ def run_in_process(scenario: Scenario, *, audit: bool) -> Played:
     return Played(run, findings, time.perf_counter() - began)
 
 
-def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | None = None) -> Played:
-    """Run `scenario` as processes.
+def as_processes(
+    scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | None = None, inbox: Inbox | None = None
+) -> Played:
+    """Run `scenario` as processes; `inbox` prints what it says, and receives signals.
 
     Unless `kills` is None, the recording is compared with that of a run in one process. `kills` may be empty.
     """
@@ -67,7 +69,7 @@ def as_processes(scenario: Scenario, *, audit: bool, kills: Sequence[Kill] | Non
         missed = processes.run_mission(
             scenario,
             out,
-            Inbox("tandem sweep"),
+            inbox or Inbox("tandem sweep"),
             run=run_name(scenario),
             rate=None,
             timeout=PROCESSES_TIMEOUT_S,

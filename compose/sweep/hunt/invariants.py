@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from itertools import combinations
-from typing import NamedTuple
 
 import msgspec
 import numpy as np
@@ -94,37 +93,28 @@ def unfinished(run: Run) -> Iterator[Breach]:
         yield Breach("unfinished", f"tick {run.end.tick}: {run.end.outcome}: {run.end.causes}")
 
 
-class Bounded(NamedTuple):
-    """Something for which a bound is computed."""
+def bounds(run: Run) -> list[tuple[str, int | None, int]]:
+    """Return what has a bound in `run`, the ticks that it took, None if it did not happen, and the bound.
 
-    what: str
-    """The end of the meeting of a pair, or the robot that is localised."""
-    ticks: int | None
-    """The ticks that it took; None if it did not happen."""
-    bound: int
-
-
-def bounded(run: Run) -> Iterator[Bounded]:
-    """Yield what has a bound in `run`: the meeting of a pair, or each robot that a group localises."""
+    It is the meeting of a pair, or each robot that a group localises.
+    """
     scenario = run.scenario
     if not guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
-        return
+        return []
+    found = [(one.visited, one.localised_tick, one.bound_ticks) for one in meeting_results(run)]
+    found += [(one.robot, one.localised_tick, one.bound_ticks) for one in search_results(run)]
     if scenario.in_pairs:
-        found = row(Trial(0, 0, scenario, processes=False), run, 0.0)
-        met, orbiting, bound = found.meeting_tick, found.orbiting_tick, found.t_max_ticks
-        if met is not None and orbiting is not None and bound is not None:
-            yield Bounded("meeting", met - orbiting, bound)
-    for one in meeting_results(run):
-        yield Bounded(one.visited, one.localised_tick, one.bound_ticks)
-    for other in search_results(run):
-        yield Bounded(other.robot, other.localised_tick, other.bound_ticks)
+        pair = row(Trial(0, 0, scenario, processes=False), run, 0.0)
+        if pair.meeting_tick is not None and pair.orbiting_tick is not None:
+            found.append(("meeting", pair.meeting_tick - pair.orbiting_tick, pair.t_max_ticks or 0))
+    return found
 
 
 def late(run: Run) -> Iterator[Breach]:
     """The computed bounds hold."""
-    for one in bounded(run):
-        if one.ticks is None or one.ticks > one.bound:
-            yield Breach("bound", f"{one.what}: {one.ticks} ticks, bound {one.bound}")
+    for what, ticks, bound in bounds(run):
+        if ticks is None or ticks > bound:
+            yield Breach("bound", f"{what}: {ticks} ticks, bound {bound}")
 
 
 def truth_lost(run: Run) -> Iterator[Breach]:

@@ -10,17 +10,15 @@ import copy
 import random
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import suppress
 from itertools import count
 from typing import Any, get_args
 
 import msgspec
 
-from compose.errors import UserError
 from compose.launch.planner_loader import PLANNER_NAMES
 from compose.scenario.fault_syntax import EVERYWHERE
 from compose.scenario.kills import DRAWN_VALUE, KILL_POINTS, WORLD
-from compose.scenario.scenario_file import scenario_table, validate
+from compose.scenario.scenario_file import scenario_table
 from compose.sweep import spec
 from compose.sweep.cells import cells
 from compose.sweep.draws import Draws, Heading, Place, StartsTable
@@ -98,37 +96,20 @@ def is_noisy(table: Mapping[str, Any]) -> bool:
     return any(table["mission"].get("noise", {}).values())
 
 
-def mutated(
-    table: Mapping[str, Any], known: Clues, draw: random.Random, changes: Mapping[Change, float] | None = None
-) -> Table:
-    """Return `table` with one to three of `changes`, or of all.
+def mutated(table: Mapping[str, Any], known: Clues, draw: random.Random) -> Table:
+    """Return `table` with one to three changes of MUTATIONS.
 
     In half of the cases noisy sensors draw other noise, too: the same noise mostly gives the same again.
     """
-    found, weights = copy.deepcopy(dict(table)), changes or MUTATIONS
+    found = copy.deepcopy(dict(table))
     if is_noisy(found) and draw.random() < 0.5:
         found["seed"] = draw.getrandbits(31)
     for _ in range(draw.choice((1, 1, 2, 3))):
         changed = None
         while changed is None:  # a change that has nothing to change would run the same input again
-            [change] = draw.choices(list(weights), list(weights.values()))
+            [change] = draw.choices(list(MUTATIONS), list(MUTATIONS.values()))
             changed = change(copy.deepcopy(found), known, draw)
         found = changed
-    return of_its_robots(found)
-
-
-def joined(table: Table, other: Table, draw: random.Random) -> Table:
-    """Return `table` with some of what `other` has: faults or kills of its robots, attack, death or noise."""
-    found = copy.deepcopy(dict(table))
-    for name in draw.sample(INHERITED, 2):
-        if name in LISTS and other.get(name):
-            found[name] = other[name]
-        elif name in other.get("group", {}) and "group" in found:
-            found["group"][name] = other["group"][name]
-        elif name == "noise" and is_noisy(other):
-            found["mission"] |= {
-                one: other["mission"][one] for one in (name, "accuracy") if one in other["mission"]
-            }
     return of_its_robots(found)
 
 
@@ -219,12 +200,14 @@ def _attack(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     part = "all" if kind in attack.OF_THE_START else draw.choice(get_args(attack.Part))
     size = draw.choice((0.01, 0.1, 0.3, 1.0)) if kind != "scale" else draw.choice((0.5, 0.99, 1.01))
     false = {"kind": kind, "size": size, "part": part}
-    if "group" in table:
-        table["group"]["attack"] = false
-    elif any("anchor" in one for one in table.get("robot", [])):
-        draw.choice([one for one in table["robot"] if "anchor" in one])["attack"] = false
-    else:
+    return _given(table, draw, "attack", false, [one for one in table.get("robot", []) if "anchor" in one])
+
+
+def _given(table: Table, draw: random.Random, field: str, value: Any, robots: list[Table]) -> Table | None:
+    """Give a `field` to the group of the input, or to one of `robots`; None if there are none."""
+    if "group" not in table and not robots:
         return None
+    (table["group"] if "group" in table else draw.choice(robots))[field] = value
     return table
 
 
@@ -248,13 +231,8 @@ LENGTHENED = (-1.0, -0.3, 0.3, 1.0)
 
 def _death(table: Table, known: Clues, draw: random.Random) -> Table | None:
     """Let a robot of a group die."""
-    if "group" in table:
-        table["group"]["dies"] = known.tick(draw)
-    elif len(table.get("robot", [])) > 2:
-        draw.choice(table["robot"])["dies"] = known.tick(draw)
-    else:
-        return None
-    return table
+    robots = table.get("robot", [])
+    return _given(table, draw, "dies", known.tick(draw), robots if len(robots) > 2 else [])
 
 
 def _noise(table: Table, _known: Clues, draw: random.Random) -> Table:
@@ -267,10 +245,6 @@ def _noise(table: Table, _known: Clues, draw: random.Random) -> Table:
         noise |= {name: {"v": 0.001, "omega": 0.001} for name in ("actuation", "odometry")}
     table["mission"] |= {"noise": noise, "accuracy": max(0.1, 2.0 * sigma)}
     return table
-
-
-def _planner(table: Table, _known: Clues, draw: random.Random) -> Table:
-    return {**table, "planner": {"name": draw.choice(PLANNER_NAMES)}}
 
 
 def _names(table: Table, _known: Clues, draw: random.Random) -> Table | None:
@@ -290,68 +264,56 @@ def _names(table: Table, _known: Clues, draw: random.Random) -> Table | None:
     return table
 
 
-def _geometry(table: Table, _known: Clues, draw: random.Random) -> Table:
-    """Change one length, speed or time of the mission, or where the anchors are."""
-    mission, factor = table["mission"], draw.choice((0.3, 0.7, 0.9, 1.1, 1.5, 3.0))
-    anchored = [one for one in table.get("robot", []) if "anchor" in one]
-    lengths = ("spacing", "spacing", "spacing") if "group" in table else ("anchor",) * bool(anchored)
-    match draw.choice((*lengths, "period", "max_speed", "max_turn_rate", "sensing_range", "safety")):
-        case "anchor":
-            one = draw.choice(anchored)
-            x, y = one["anchor"]
-            one["anchor"] = [x * factor, y * factor + draw.choice((0.0, 0.0, 2.0))]
-            one.pop("start", None)
-        case "safety":
-            mission["safety_distance"] = draw.choice((0.0, 0.3, 0.8))
-        case "spacing":
-            table["group"]["spacing"] *= factor
-        case name:
-            mission[name] = mission[name] * factor
+def _setting(table: Table, _known: Clues, draw: random.Random) -> Table | None:
+    """Change a number or a name in a table that the input has: one of SETTINGS, or by one of FACTORS."""
+    path = draw.choice([*SETTINGS, *SCALED])
+    part, _, name = path.partition(".")
+    if part not in table and part != "planner":
+        return None
+    inner = table.setdefault(part, {})
+    inner[name] = draw.choice(SETTINGS[path]) if path in SETTINGS else inner[name] * draw.choice(FACTORS)
     return table
 
 
-def _size(table: Table, _known: Clues, draw: random.Random) -> Table | None:
-    """Change the number of robots of a group, of those without an anchor, or of those that may be false."""
-    if "group" not in table:
+SETTINGS: Mapping[str, Sequence[Any]] = {
+    "planner.name": PLANNER_NAMES,
+    "mission.safety_distance": (0.0, 0.3, 0.8),
+    "mission.tolerates": (0, 1),
+    "group.robots": (3, 3, 4, 5),
+    "group.without_anchor": (0, 1),
+}
+"""The values from which fields are drawn."""
+SCALED = (
+    "mission.period", "mission.max_speed", "mission.max_turn_rate", "mission.sensing_range", "group.spacing",
+)  # fmt: skip
+"""The lengths, speeds and times that are multiplied."""
+FACTORS = (0.3, 0.7, 0.9, 1.1, 1.5, 3.0)
+"""The factors of lengths, speeds and times."""
+
+
+def _anchor(table: Table, _known: Clues, draw: random.Random) -> Table | None:
+    """Move an anchor; its robot then starts anywhere in its range."""
+    anchored = [one for one in table.get("robot", []) if "anchor" in one]
+    if not anchored:
         return None
-    group = table["group"]
-    match draw.randrange(3):
-        case 0:
-            group["robots"] = draw.choice((3, 3, 4, 5))
-        case 1:
-            group["without_anchor"] = draw.choice((0, 1))
-        case _:
-            table["mission"]["tolerates"] = draw.choice((0, 1))
+    one, factor = draw.choice(anchored), draw.choice(FACTORS)
+    x, y = one["anchor"]
+    one["anchor"] = [x * factor, y * factor + draw.choice((0.0, 0.0, 2.0))]
+    one.pop("start", None)
     return table
 
 
 def _less(table: Table, _known: Clues, draw: random.Random) -> Table | None:
-    """Leave something out that a mission does not need."""
-    shorter = list(simpler(table, {}))
-    for one in draw.sample(shorter, min(len(shorter), SHORTENED)):
-        with suppress(UserError):
-            validate(one, "the input")
-            return one
-    return None
+    """Leave out some of the faults, kills and clocks."""
+    lists = [name for name in LISTS if table.get(name)]
+    if not lists:
+        return None
+    name = draw.choice(lists)
+    return {**table, name: draw.sample(table[name], draw.randrange(len(table[name])))}
 
 
 IN_TURN_SHARE = 0.3
 """The share of kills that are those of one process at one point of consecutive ticks."""
-SHORTENED = 5
-"""The number of shorter inputs of which the first that is a mission is taken."""
-
-
-def _retimed(table: Table, known: Clues, draw: random.Random) -> Table | None:
-    """Move a fault or a kill to another tick."""
-    listed = [*table.get("fault", []), *table.get("kill", [])]
-    if not listed:
-        return None
-    one, tick = draw.choice(listed), known.tick(draw)
-    if "who" in one:
-        one["tick"] = tick
-    elif "ticks" in one:
-        one["ticks"] = [tick, tick + one["ticks"][1] - one["ticks"][0]]
-    return table
 
 
 Change = Callable[[Table, Clues, random.Random], Table | None]
@@ -366,16 +328,12 @@ MUTATIONS: Mapping[Change, float] = {
     _link: 0.5,
     _death: 0.7,
     _noise: 0.4,
-    _planner: 0.3,
     _names: 0.7,
-    _geometry: 1.0,
-    _size: 1.0,
+    _setting: 1.5,
+    _anchor: 0.5,
     _less: 1.5,
-    _retimed: 1.5,
 }
 """The changes of an input, and how often each is drawn."""
-WITHIN_BOUNDS: Mapping[Change, float] = {_seed: 1.0, _start: 1.0, _geometry: 2.0, _size: 0.5}
-"""The changes after which the computed bounds still hold, and how often each is drawn to climb one."""
 
 
 def simpler(table: Table, source: Table) -> Iterator[Table]:
@@ -417,8 +375,6 @@ def _nearer(rows: Sequence[Any], others: Sequence[Any]) -> Iterator[list[Any]]:
 
 LISTS = ("clock", "fault", "kill")
 """The lists of a scenario file whose rows are in no order."""
-INHERITED = ("fault", "kill", "attack", "dies", "noise")
-"""The parts of an input that it may get from another one."""
 
 
 def fault_lines(table: Mapping[str, Any], source: Mapping[str, Any]) -> int:

@@ -11,7 +11,6 @@ from agent.planning.planner import Planner
 from compose.launch.planner_loader import planner_of
 from compose.recording.run import Run
 from protocol.messages import Observation, Report, RobotConfig, Verdict
-from protocol.wire import encode
 
 MESSAGES = (
     "log", "no log", "pose", "ranges", "result",
@@ -42,47 +41,17 @@ class TooLongError(Exception):
     """The mission lasts beyond the last tick that a WatchedPlanner was given."""
 
 
-class DecisionDiffersError(Exception):
-    """A planner has decided otherwise on the same state and reports."""
-
-
-REPEATED_EACH = 8
-"""The number of decisions of a robot of which one is made twice: all are a third of the time of a run."""
-
-
 class WatchedPlanner:
-    """A planner that notes in `seen` which conditions kept a robot from its claim, and in which task.
+    """A planner that notes in `seen` which conditions kept a robot from its claim, and in which task."""
 
-    It makes some decisions twice, and raises DecisionDiffersError if they differ.
-    """
-
-    def __init__(self, config: RobotConfig, seen: set[str], last: float, first: int = 0) -> None:
-        """Begin with the planner of `config`; after the tick `last`, `command` raises TooLongError.
-
-        The decision `first` is made twice, and each REPEATED_EACH-th after it.
-        """
+    def __init__(self, config: RobotConfig, seen: set[str], last: float) -> None:
+        """Begin with the planner of `config`; after the tick `last`, `command` raises TooLongError."""
         self._planner: Planner[Any, Any] = planner_of(config)
-        self._robot, self._seen, self._last = config.robot, seen, last
-        self._until_repeated = first
+        self._seen, self._last = seen, last
         _unmet.clear()  # what an earlier run has left
 
     def __getattr__(self, name: str) -> Any:
         return getattr(self._planner, name)
-
-    def decide(self, state: Any, reports: Any) -> Any:
-        """Return the state after the decision of the planner."""
-        decided = self._planner.decide(state, reports)
-        if self._until_repeated == 0:
-            self._until_repeated = REPEATED_EACH
-            one, other = (
-                [encode(made(after)) for made in (self._planner.command, self._planner.estimate)]
-                for after in (decided, self._planner.decide(state, reports))
-            )
-            if one != other:
-                tick = self._planner.command(decided).tick
-                raise DecisionDiffersError(f"tick {tick}: {self._robot} decides otherwise on the same inputs")
-        self._until_repeated -= 1
-        return decided
 
     def command(self, state: Any) -> Any:
         """Return the Command of the planner."""
