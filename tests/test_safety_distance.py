@@ -305,6 +305,17 @@ def test_no_robot_has_to_keep_the_distance_to_a_dead_one_which_it_cannot_range()
     assert audit_run(run).violations == ()
 
 
+def test_no_robot_has_to_keep_a_distance_that_an_outlier_hides() -> None:
+    """Two robots begin 0.178 m apart, and their first range is too long; a hunt has found this mission."""
+    table = table_of(4, 0)
+    table["mission"] |= {"max_turn_rate": math.pi, "safety_distance": 0.3, "noise": {"outliers": 0.2}}
+    table |= {"seed": 1810307481, "group": {"robots": 4, "spacing": 30.0}}
+    del table["robot"]
+    run = of_frames(kept(validate(table, "outliers.toml").seeded(None)))
+    assert nearest(run) == pytest.approx(0.173, abs=1e-3)
+    assert audit_run(run).violations == ()
+
+
 @pytest.mark.long
 def test_the_audit_of_a_group_with_a_safety_distance_is_clean() -> None:
     found = audit_run(of_frames(kept(group_apart(4, 10, 1.0))))

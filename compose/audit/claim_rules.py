@@ -47,14 +47,16 @@ def claim(run: Run) -> Checks:
 def distance(run: Run) -> Checks:
     """Check that no two robots came nearer than the safety distance, nor than they began.
 
-    Under noise, three sigmas of a range less: that is how well robots know it. Robots whose sensors are not
-    what they were told, or among attackers, cannot keep it.
+    Under noise, three sigmas of a range less: that is how well robots know it. Robots cannot keep it with
+    outliers, among attackers, or if their sensors are not what they were told.
     """
-    least = run.scenario.mission.safety_distance
-    if not least or not _as_told(run.scenario) or (found := nearest(run)) is None:
+    mission = run.scenario.mission
+    if not mission.safety_distance or mission.noise.outliers or not _as_told(run.scenario):
+        return
+    if (found := nearest(run)) is None:
         return
     begun = [travelled(*two) for two in combinations(run.ticks[0].truth.poses, 2)]
-    least = min([least, *begun]) - LARGEST_ERROR_SIGMAS * run.scenario.mission.noise.mutual_sigma
+    least = min([mission.safety_distance, *begun]) - LARGEST_ERROR_SIGMAS * mission.noise.mutual_sigma
     what = f"two robots came {found:.6g} m near, expected at least {least:.6g} m"
     near = found < least * (1.0 - TOUCHING)
     yield Violation("distance", run.length - 1, None, what) if near else None

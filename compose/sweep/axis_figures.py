@@ -197,7 +197,8 @@ def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
     crowded = numbers is None and sum(map(len, labels)) > FITTING
     figure = Figure(figsize=(7.2, 5.0 if crowded else 3.6), layout="constrained")
     axes = figure.subplots()
-    axes.set_xlabel(axis.name if axis.paired else f"{axis.name} (other draws at each value)")
+    name = axis.name.replace("-", " ")
+    axes.set_xlabel(name if axis.paired else f"{name} (other draws at each value)")
     axes.grid(axis="y", lw=0.4, color="0.85")
     if numbers is not None:
         if min(numbers) > 0.0 and max(numbers) >= LOGARITHMIC * min(numbers):
