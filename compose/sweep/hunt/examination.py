@@ -51,6 +51,8 @@ class Examined(msgspec.Struct, frozen=True):
     breaches: tuple[Breach, ...] = ()
     reached: frozenset[str] = frozenset()
     known: Clues = Clues(())
+    bound_share: float = 0.0
+    """The largest share of a computed bound that something took."""
     refused: str | None = None
     """The reason why the input was not run; None if it was."""
 
@@ -104,7 +106,8 @@ def examined(table: dict[str, Any], seen: Set[str] | None = None) -> Examined:
     except Exception as error:  # noqa: BLE001  # nor a reader of the recording, or a rule of the audit
         return Examined((*again, Breach("the recording is misread", f"{type(error).__name__}: {error}")))
     ids = tuple([one.id for one in scenario.robots])
-    return Examined(tuple(every), frozenset(found | near), Clues(ids, run.length - 1, moments))
+    used = max([ticks / bound for ticks, bound in parts], default=0.0)
+    return Examined(tuple(every), frozenset(found | near), Clues(ids, run.length - 1, moments), used)
 
 
 def watched(scenario: Scenario, seen: set[str]) -> tuple[dict[str, MemoryJournal], EncodedMessages, bool]:

@@ -16,11 +16,28 @@ from compose.launch.supervisor import ChildFailed
 from compose.sweep.hunt import reached_states
 from compose.sweep.hunt.examination import Examined, examined, scenario_of
 from compose.sweep.hunt.invariants import Breach
-from compose.sweep.hunt.mutation import LISTS, Clues, Table, is_noisy, mutated, robots_of, seeds, simpler
+from compose.sweep.hunt.mutation import (
+    LISTS,
+    WITHIN_BOUNDS,
+    Clues,
+    Table,
+    is_noisy,
+    mutated,
+    robots_of,
+    seeds,
+    simpler,
+)
 from compose.sweep.trial_mission import as_processes
 
 BATCH = 16
 """The number of inputs that are drawn from one state of the corpus, so that the workers do not matter."""
+CLIMBING = 5
+"""One of so many inputs is a change of one that came near to a computed bound."""
+NEARER = 24
+"""The power of the share of its bound by which such an input is chosen.
+
+With the mutant `bound`, the hunt then ends with run 448; without such inputs, not in 2 988 runs.
+"""
 HANG_S = 600.0
 """The time in s after which an input counts as one that never ends."""
 MOST_TRIES = 100
@@ -44,6 +61,8 @@ class CorpusEntry(NamedTuple):
 
     table: Table
     known: Clues
+    bound_share: float = 0.0
+    """The largest share of a computed bound that its run took."""
 
     @property
     def share(self) -> float:
@@ -98,14 +117,21 @@ class Hunt:
         """Return the inputs of batch `number`: one of the seeds, many of which are slow, and mutations."""
         begin, draw = self.seeds[number : number + 1], random.Random(f"{self._seed}/hunt/{number}")
         shares = [one.share if self._guided else 1.0 for one in self.corpus]
-        drawn = draw.choices(self.corpus, shares, k=BATCH - len(begin))
-        return [*begin, *[mutated(one.table, one.known, draw) for one in drawn]]
+        near = [one.share * one.bound_share**NEARER for one in self.corpus]
+        climbing = BATCH // CLIMBING if self._guided and any(near) else 0
+        drawn = draw.choices(self.corpus, shares, k=BATCH - len(begin) - climbing)
+        climbed = draw.choices(self.corpus, near, k=climbing) if climbing else []
+        return [
+            *begin,
+            *[mutated(one.table, one.known, draw) for one in drawn],
+            *[mutated(one.table, one.known, draw, WITHIN_BOUNDS) for one in climbed],
+        ]
 
     def _keep(self, table: Table, result: Examined) -> None:
         """Note what the run of an input has shown, and keep the input if that is new."""
         if not result.known.robots:
             return
-        entry = CorpusEntry(table, result.known)
+        entry = CorpusEntry(table, result.known, result.bound_share)
         for i in [i for i, one in enumerate(self.seeds) if one is table]:
             self.corpus[i] = entry
         if self._guided and not result.reached <= self.seen:

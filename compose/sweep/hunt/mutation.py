@@ -96,18 +96,20 @@ def is_noisy(table: Mapping[str, Any]) -> bool:
     return any(table["mission"].get("noise", {}).values())
 
 
-def mutated(table: Mapping[str, Any], known: Clues, draw: random.Random) -> Table:
-    """Return `table` with one to three changes of MUTATIONS.
+def mutated(
+    table: Mapping[str, Any], known: Clues, draw: random.Random, changes: Mapping[Change, float] | None = None
+) -> Table:
+    """Return `table` with one to three of `changes`, by default of MUTATIONS.
 
     In half of the cases noisy sensors draw other noise, too: the same noise mostly gives the same again.
     """
-    found = copy.deepcopy(dict(table))
+    found, weights = copy.deepcopy(dict(table)), changes or MUTATIONS
     if is_noisy(found) and draw.random() < 0.5:
         found["seed"] = draw.getrandbits(31)
     for _ in range(draw.choice((1, 1, 2, 3))):
         changed = None
         while changed is None:  # a change that has nothing to change would run the same input again
-            [change] = draw.choices(list(MUTATIONS), list(MUTATIONS.values()))
+            [change] = draw.choices(list(weights), list(weights.values()))
             changed = change(copy.deepcopy(found), known, draw)
         found = changed
     return of_its_robots(found)
@@ -334,6 +336,8 @@ MUTATIONS: Mapping[Change, float] = {
     _less: 1.5,
 }
 """The changes of an input, and how often each is drawn."""
+WITHIN_BOUNDS: Mapping[Change, float] = {_seed: 1.0, _start: 1.0, _setting: 1.5, _anchor: 1.0}
+"""The changes after which computed bounds still hold, and how often each is drawn to come nearer to one."""
 
 
 def simpler(table: Table, source: Table) -> Iterator[Table]:
