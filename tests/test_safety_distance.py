@@ -305,6 +305,20 @@ def test_no_robot_has_to_keep_the_distance_to_a_dead_one_which_it_cannot_range()
     assert audit_run(run).violations == ()
 
 
+def test_a_robot_that_was_held_back_takes_no_range_from_its_start_for_a_second_one() -> None:
+    """Two robots begin 0.295 m apart, until r2 dies; a hunt has found this mission.
+
+    The range after a turn on the spot told r1 that it faces its anchor. So r3 found r1 inconsistent.
+    """
+    table = table_of(3, 0)
+    table["mission"] |= {"max_turn_rate": math.pi, "safety_distance": 0.3}
+    table |= {"seed": 1061111899, "group": {"robots": 3, "spacing": 9.0, "dies": 5}}
+    del table["robot"]
+    run = of_frames(kept(validate(table, "held.toml").seeded(None)))
+    assert localised(run) == {"r1", "r3"}
+    assert audit_run(run).violations == ()
+
+
 def test_no_robot_has_to_keep_a_distance_that_an_outlier_hides() -> None:
     """Two robots begin 0.178 m apart, and their first range is too long; a hunt has found this mission."""
     table = table_of(4, 0)

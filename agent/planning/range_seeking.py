@@ -45,7 +45,9 @@ def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoe
         case Turning(beacon, origin, rho0, heading):
             return task if abs(heading - pose.heading) > tolerance else Circling(beacon, origin, rho0)
         case _:
-            return None if measured else task
+            # where another robot has blocked all ways so far, a range beside the origin tells no direction
+            has_moved = not separation.is_tight(travelled(task.origin, pose), state.config.mission)
+            return None if measured and has_moved else task
 
 
 def _is_blocked(state: RobotState) -> bool:
