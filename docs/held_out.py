@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.estimation.following import ClaimRule
+from compose.errors import UserError
 from compose.recording.estimating.estimate_run import estimated
 from compose.recording.estimating.radio_errors import PairErrors, range_calibration
 from compose.recording.estimating.recorded_measurements import measurements
@@ -31,10 +32,14 @@ def without(recording: RangeRecording, anchor: str) -> RangeRecording:
 
 
 def estimated_path(recording: RangeRecording, robot: str, window: Window, accuracy: float) -> Numbers:
-    """Return the time (s), x and y (m) of a robot at each tick, by all measurements; shape (K, 3)."""
+    """Return the time (s), x and y (m) of a robot at each tick, by all measurements; shape (K, 3).
+
+    Raises UserError if they do not locate it.
+    """
     measured = measurements(recording, [robot], None, window)
     fitted = estimated(measured, ClaimRule(accuracy)).epochs[-1].fitted
-    assert fitted is not None, f"{robot} is not located"
+    if fitted is None:
+        raise UserError(f"{recording.source}: without an anchor, {robot} is not located")
     path, origin = fitted.fit.paths[0], fitted.used.origin
     times = measured.time_of(np.arange(len(path)))
     return np.column_stack((times, path[:, 0] + origin[0], path[:, 1] + origin[1]))
@@ -70,7 +75,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     first, last = recording.span
     print("| begin s | anchor left out | ranges | sigma by the estimate m | sigma by the truth m |")
     print("|---|---|---|---|---|")
-    for begin in np.arange(0.0, last - first - options.seconds + 1.0, options.seconds).tolist():
+    for begin in np.arange(0.0, max(last - first - options.seconds, 0.0) + 1.0, options.seconds).tolist():
         for anchor in [one.id for one in recording.anchors]:
             for robot in [one.id for one in recording.robots]:
                 window = (begin, begin + options.seconds)
@@ -86,4 +91,7 @@ def _sigma(errors: PairErrors) -> float:
 
 
 if __name__ == "__main__":
-    main()
+    try:
+        main()
+    except UserError as error:
+        raise SystemExit(f"held_out.py: {error}") from None

@@ -37,6 +37,15 @@ period = 1.0
 max_speed = 1.0
 max_turn_rate = 3.141592653589793
 """
+PAIR = """
+[[robot]]
+id = "a"
+anchor = [0.0, 0.0]
+[[robot]]
+id = "b"
+anchor = [10.0, 0.0]
+"""
+"""The robots of a pair with drawn starts."""
 BENT = 249
 """A seed of `noisy` with which both positions lie along arcs for a tick."""
 

@@ -1,4 +1,4 @@
-"""What a role may do in the network, by a router, and what one robot's certificate cannot forge."""
+"""The rights of each role in the network, enforced by a router; a robot's certificate forges no other."""
 
 from __future__ import annotations
 

@@ -51,7 +51,7 @@ from protocol.messages import Command
 from protocol.mission import ROLES, Role
 from protocol.motion import step, wrap
 from protocol.wire import MalformedFrame, decode, encode
-from tests.commands import PAPER_1, SECTION_IV, copied, on_a_terminal, several_pairs, tandem
+from tests.commands import PAIR, PAPER_1, SECTION_IV, copied, on_a_terminal, several_pairs, tandem
 from tests.reference import REFERENCE
 from tests.series import series
 from world.scenario import Scenario
@@ -61,14 +61,7 @@ FAULT = "[[fault]]\nloss = 0.6\ndelay = [0, 5]\n"
 RANDOM = f"""
 name = "random"
 seed = 3
-{SECTION_IV}
-[[robot]]
-id = "a"
-anchor = [0.0, 0.0]
-[[robot]]
-id = "b"
-anchor = [10.0, 0.0]
-"""
+{SECTION_IV}{PAIR}"""
 NOISY_PAPER = RANDOM.replace("seed = 3", "seed = 5").replace(
     "[[robot]]", f'{NOISE}[planner]\nname = "paper"\n[[robot]]', 1
 )

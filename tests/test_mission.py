@@ -1,4 +1,4 @@
-"""What follows from the mission parameters: the plan, turn rates, bounds, and the time until orbits meet."""
+"""Results of the mission parameters: the plan, turn rates, bounds, and the time until orbits meet."""
 
 from __future__ import annotations
 

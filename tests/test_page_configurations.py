@@ -1,4 +1,4 @@
-"""What the page draws over the plane: configurations with the distances that they predict, and attacks."""
+"""Drawings of the page over the plane: configurations with the distances that they predict, and attacks."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What is made of the runs of teams: audits, exports, figures, the page, anchors by name, claims."""
+"""Results of the runs of teams: audits, exports, figures, the page, anchors by name, claims."""
 
 from __future__ import annotations
 

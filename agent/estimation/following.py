@@ -222,7 +222,7 @@ class Following(NamedTuple):
         )
 
     def _displaced(self, *, retested: bool) -> Following:
-        """Return this with what the latest test of the anchors says in `judged`, or a new one."""
+        """Return this with `judged` by the latest test of whether an anchor is displaced, or by a new one."""
         now, part = self, self.part
         assert part is not None
         if retested:

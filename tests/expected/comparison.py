@@ -68,7 +68,7 @@ class Count(msgspec.Struct, frozen=True):
 
 
 class Place(NamedTuple):
-    """Of what a statistic is."""
+    """The part of the results that a statistic is of."""
 
     level: Level
     sweep: str
