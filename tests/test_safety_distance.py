@@ -261,11 +261,17 @@ def test_all_robots_keep_the_distance_and_are_localised_within_the_bound(
     assert run.end.tick * scenario.mission.period <= scenario.meetings[-1].ends
 
 
+DENSE = {"max_turn_rate": math.pi, "safety_distance": 0.5}
+NOISE = {"accuracy": 0.3, "noise": {"anchor_sigma": 0.05, "mutual_sigma": 0.05}}
 BLOCKED = {
     "on an orbit, by one that waits": (76739130, 4, 30.0, {"sensing_range": 2.1, "period": 0.77}),
     "in phase 1, by one that drives towards it": (82, 6, 15.0, {}),
+    "on a circle in phase 1": (9, 4, 10.0, {"max_turn_rate": math.pi}),
+    "on a circle in phase 3, by one that is visited": (8, 3, 10.0, DENSE),
+    "on a circle in phase 3, by one that blocks a third one": (28, 4, 10.0, DENSE),
+    "beside a circle, at the start": (25, 4, 10.0, DENSE),
 }
-"""Groups in which two robots stopped for each other for ever: seed, robots, spacing and mission."""
+"""Groups in which robots stopped for each other for ever: seed, robots, spacing and mission."""
 
 
 @pytest.mark.parametrize("name", BLOCKED)
@@ -289,7 +295,40 @@ def test_robots_that_block_each_other_make_way(name: str) -> None:
     assert audit_run(run).violations == ()
     least = nearest(run)
     assert least is not None
-    assert least >= 0.3 - 1e-9
+    assert least >= run.scenario.mission.safety_distance - 1e-9
+
+
+NEAR_STARTS = {
+    "held back on the way to a third point": (0.3, 3.528, (1.64, -1.39, 0.15), (2.31, 1.06, -0.92), {}),
+    "on a circle, by one that stands": (0.5, 2.408, (0.58, 0.05, -2.66), (-0.39, -0.39, -2.80), {}),
+    "by one that stands, under noise": (0.3, 1.595, (0.60, -0.01, 0.74), (-0.64, 1.87, 1.85), NOISE),
+}
+"""Pairs that ended undecided: the safety distance, the x of b's anchor, the starts, and noise."""
+
+
+@pytest.mark.parametrize("name", NEAR_STARTS)
+def test_two_robots_that_begin_near_each_other_are_localised(name: str) -> None:
+    safety, x, a, b, noise = NEAR_STARTS[name]
+    table = {
+        "name": "near",
+        "mission": {
+            "sensing_range": 3.0,
+            "period": 1.0,
+            "max_speed": 1.0,
+            "max_turn_rate": math.pi,
+            "safety_distance": safety,
+            **noise,
+        },
+        "robot": [
+            {"id": "a", "anchor": [0.0, 0.0], "start": a},
+            {"id": "b", "anchor": [x, 0.0], "start": b},
+        ],
+    }
+    run = run_mission(validate(table, "near.toml").seeded(33))
+    assert localised(run) == {"a", "b"}
+    least = nearest(run)
+    assert least is not None
+    assert least >= safety - 1e-9
 
 
 def test_no_robot_has_to_keep_the_distance_to_a_dead_one_which_it_cannot_range() -> None:

@@ -17,6 +17,12 @@ from protocol.orbits import Orbit
 ASIDE = 1e-9
 """The distance from a place at which a straight to it may end beside it, as a fraction of A_0."""
 
+OFF_CIRCLE = 0.1
+"""How far a robot may be off its circle, as a fraction of A_0, and turned from its tangent, in rad.
+
+A robot that is farther off was held back by another one (see `separation`), and returns to the circle.
+"""
+
 LOOKAHEAD = 1.5
 """The distance of the pursued point ahead on the orbit, in ticks of the orbit's speed.
 
@@ -28,30 +34,19 @@ def controls(state: RobotState) -> Controls:
     """Return the controls of the current task, or of a way aside (see `travelling`)."""
     task, odometry, mission = state.task, state.odometry, state.config.mission
     match task:
-        case tasks.Orbital() | tasks.Travelling() if state.passing.places:
+        case _ if state.passing.places and tasks.drives_aside(task):
             return way_to(state, state.passing.places[0], backward=True) or REST
         case tasks.Orbiting():
             return task.command or state.config.orbit.controls
-        case tasks.Aligning(heading) | tasks.Tangent(heading) | tasks.Turning(heading=heading):
+        case tasks.Aligning(heading) | tasks.Tangent(heading):
             return turn(odometry, heading, mission)
         case tasks.Radial():
             return straight(left_to_orbit(state), mission)
-        case tasks.Straight(beacon, origin, rho0) | tasks.Backing(beacon, origin, rho0):
-            step, forward = step_length(beacon, rho0, mission), isinstance(task, tasks.Straight)
-            left = step - travelled(origin, odometry) if forward else -step - relative(origin, odometry).x
-            return straight(left, mission)
-        case tasks.Circling(beacon, _, rho0):
-            radius = step_length(beacon, rho0, mission)
-            part = inside_arc(rho0, radius, mission.sensing_range) / mission.period
-            omega = min(mission.max_turn_rate, part, mission.max_speed / radius)
-            return Controls(omega * radius, omega)
-        case (
-            tasks.ThirdPoint()
-            | tasks.LastManoeuvre()
-            | tasks.Returning()
-            | tasks.Surveying()
-            | tasks.Retreating()
-        ):
+        case tasks.Searching():
+            return _seeking(state, task)
+        case tasks.ThirdPoint():
+            return left_of(task, odometry, mission)
+        case tasks.LastManoeuvre() | tasks.Returning() | tasks.Surveying() | tasks.Retreating():
             return task.command
         case tasks.Homing(place) | tasks.Travelling(place):
             return way_to(state, place, backward=isinstance(task, tasks.Homing)) or REST
@@ -60,6 +55,51 @@ def controls(state: RobotState) -> Controls:
             return Controls(min(way.v, coverage_speed(mission)), way.omega)
         case _:
             return REST
+
+
+def _seeking(state: RobotState, task: tasks.Searching) -> Controls:
+    """Return the controls of the search for a second range to a beacon."""
+    odometry, mission, origin = state.odometry, state.config.mission, task.origin
+    step = step_length(task.beacon, task.rho0, mission)
+    match task:
+        case tasks.Straight():
+            return straight(step - travelled(origin, odometry), mission)
+        case tasks.Backing():
+            return straight(-step - relative(origin, odometry).x, mission)
+        case tasks.Turning(heading=heading):
+            return turn(odometry, heading, mission)
+        case _:
+            return _on_circle(state, task, step)
+
+
+def _on_circle(state: RobotState, task: tasks.Searching, radius: float) -> Controls:
+    """Return the controls on the circle of this radius (m) about the origin of `task`, or back to it.
+
+    The way back leads straight to the nearest place of the circle.
+    """
+    odometry, mission, center = state.odometry, state.config.mission, task.origin
+    x, y = odometry.x - center.x, odometry.y - center.y
+    distance = math.hypot(x, y)
+    if distance > 0.0 and abs(distance - radius) > OFF_CIRCLE * mission.first_straight:
+        place = center.x + x * radius / distance, center.y + y * radius / distance
+        return way_to(state, place, backward=True) or REST
+    off = wrap(math.atan2(y, x) + 0.5 * math.pi - odometry.heading)
+    if abs(off) > OFF_CIRCLE:
+        return turn(odometry, odometry.heading + off, mission)
+    part = inside_arc(task.rho0, radius, mission.sensing_range) / mission.period
+    omega = min(mission.max_turn_rate, part, mission.max_speed / radius)
+    return Controls(omega * radius, omega)
+
+
+def left_of(task: tasks.ThirdPoint, odometry: Pose, mission: Mission) -> Controls:
+    """Return the controls of what is left of the arc to the third point."""
+    v, omega = task.command.v, task.command.omega
+    if odometry == task.origin:
+        return task.command
+    turned, driven = odometry.heading - task.origin.heading, travelled(task.origin, odometry)
+    done = turned / omega if omega else driven / abs(v)
+    left = max(0.0, 1.0 - done / mission.period)
+    return Controls(v * left, omega * left)
 
 
 def step_length(beacon: Beacon, rho0: float, mission: Mission) -> float:

@@ -23,6 +23,7 @@ from agent.planning import (
     range_seeking,
     separation,
     tasks,
+    travelling,
 )
 from agent.planning.phase3_last_manoeuvre import Plan, Question
 from agent.planning.planner import Manoeuvres, Planner, Summary
@@ -172,8 +173,12 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def observe(self, state: RobotState, observation: Observation) -> RobotState:
         """Return `state` with the sensor data of one tick, and with the task that follows from them."""
-        state, ranged = observed(state, observation), observation.anchor_range is not None
-        task = state.task
+        after = self._with_task(observed(state, observation), observation)
+        return after if after.config.members else travelling.onward(after, observation.contacts)
+
+    def _with_task(self, state: RobotState, observation: Observation) -> RobotState:
+        """Return `state` with the task that follows from its sensor data."""
+        task, ranged = state.task, observation.anchor_range is not None
         match task:  # in real time, a manoeuvre may not have been executed
             case tasks.Orbiting(None) | tasks.Resting() | tasks.Done():  # most ticks
                 return state
@@ -185,7 +190,7 @@ class LogPlanner(Planner[RobotState, Report]):
             case tasks.Searching():
                 seeking = range_seeking.onward(state, task, ranged, self.MANOEUVRES)
                 return state.doing(seeking) if seeking else self._steps(state).phase1(state, self.MANOEUVRES)
-            case tasks.ThirdPoint(_, origin) if state.odometry != origin:
+            case tasks.ThirdPoint() if phase1_anchor.has_ended(state, task, ranged):
                 return self._steps(state).phase1(state, self.MANOEUVRES)
             case tasks.LastManoeuvre(_, origin) | tasks.Returning(_, origin) if state.odometry != origin:
                 return phase3_encounter.after_last_manoeuvre(state, task)

@@ -15,7 +15,7 @@ from agent.estimation.estimator import AnchorEstimate
 from agent.estimation.exact import Branch
 from agent.estimation.gaussian.mission_measurements import path_of
 from agent.estimation.gaussian.own_anchor import anchor_planning_hypotheses, followed, is_anchor_known
-from agent.planning import phase2_orbit, range_seeking, tasks
+from agent.planning import drive, phase2_orbit, range_seeking, tasks
 from agent.planning.active_sensing import next_objective, plan_alone
 from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
@@ -184,6 +184,20 @@ def _to_third_point(
     if command is None:
         return state.undecided("eq. (5) allows no manoeuvre to a third range")
     return state.doing(tasks.ThirdPoint(estimate.branches, state.odometry, command))
+
+
+def has_ended(state: RobotState, task: tasks.ThirdPoint, ranged: bool) -> bool:
+    """Return whether the manoeuvre to the third point is over: at its end, or where another robot blocks it.
+
+    A range on the way, of a robot that keeps the safety distance, ends it as well. In real time, it may not
+    have begun.
+    """
+    if state.odometry == task.origin:
+        return False
+    mission = state.config.mission
+    left = mission.period * abs(drive.left_of(task, state.odometry, mission).v)
+    is_at_end = left <= SHORTEST_MANOEUVRE * mission.first_straight
+    return ranged or is_at_end or not mission.safety_distance or range_seeking.is_blocked(state)
 
 
 def _ended(state: RobotState, estimate: AnchorEstimate, kind: BranchKind) -> RobotState:

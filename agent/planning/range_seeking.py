@@ -34,7 +34,7 @@ def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoe
             ahead = isinstance(task, Straight)
             driven = travelled(origin, pose) if ahead else -relative(origin, pose).x
             is_short = driven < step - distance_tolerance
-            if is_short and not _is_blocked(state):
+            if is_short and not is_blocked(state):
                 return task
             if measured and not is_short:
                 return None
@@ -50,7 +50,7 @@ def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoe
             return None if measured and has_moved else task
 
 
-def _is_blocked(state: RobotState) -> bool:
+def is_blocked(state: RobotState) -> bool:
     """Return whether the robot has hardly moved in the last tick, to keep the safety distance.
 
     One that drives away from another robot moves farther in each tick.

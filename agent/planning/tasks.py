@@ -165,6 +165,15 @@ class Travelling(msgspec.Struct, frozen=True):
     """The number of legs of the search up to this place; 0 on the way to the robot."""
 
 
+def drives_aside(task: object) -> bool:
+    """Return whether a robot at this task drives aside if another one blocks it (see `travelling`).
+
+    In phase 1, a straight that is blocked is left for the next step of the search.
+    """
+    on_its_way = isinstance(task, Orbital | Travelling | Circling)
+    return on_its_way or (isinstance(task, Surveying) and task.beacon == "anchor")
+
+
 def transformed(transform: Pose, places: Iterable[Place]) -> tuple[Place, ...]:
     """Return `places`, in m, in the frame in which their own frame has the pose `transform`."""
     moved = [compose(transform, Pose(x, y, 0.0)) for x, y in places]

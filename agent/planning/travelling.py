@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from agent.planning import drive, phase2_orbit, separation
 from agent.planning.drive import way_to
 from agent.planning.state import Bypass, RobotState
-from agent.planning.tasks import Orbital, Orbiting, Travelling, transformed
+from agent.planning.tasks import Measuring, Orbiting, Travelling, drives_aside, transformed
 from protocol.coverage_strips import Place
 from protocol.messages import Contact
 from protocol.mission import Mission
@@ -136,20 +136,23 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
     mission, passing, task = state.config.mission, state.passing, state.task
     if not mission.safety_distance:
         return state
-    met = state.config.peer if state.in_contact else None
+    is_aside = drives_aside(task) and not (isinstance(task, Orbiting) and state.config.orbit.v == 0.0)
+    seeks = is_aside and isinstance(task, Measuring)  # it does not plan with the place of its peer
+    met = state.config.peer if state.in_contact and not seeks else None
     ranges = {one.peer: one.range for one in contacts if one.peer != met}
-    stays = isinstance(task, Orbiting) and state.config.orbit.v == 0.0
-    if stays or not isinstance(task, Travelling | Orbital):
+    if not is_aside:
         return replace(state, passing=Bypass(leeway(ranges, mission), detours=passing.detours))
     if passing.places:  # what it does after the way aside begins where that ends
-        on_visit = isinstance(task, Travelling)
-        state = state.doing(Travelling(stop(state)) if on_visit else phase2_orbit.aligning(state))
+        if isinstance(task, Travelling):
+            state = state.doing(Travelling(stop(state)))
+        elif not seeks:
+            state = state.doing(phase2_orbit.aligning(state))
         if way_to(state, passing.places[0], backward=True) is None:
             passing = replace(passing, places=passing.places[1:])
             state = replace(state, passing=passing)
     before = [one for one in ranges if one < state.config.robot]
     after = passed(passing, ranges, before, state.odometry, drive.controls(state), mission)
-    if after.detours > passing.detours and (passing.places or isinstance(task, Travelling)):
+    if after.detours > passing.detours and (passing.places or seeks or isinstance(task, Travelling)):
         after = replace(after, places=after.places[:2])  # its next task leads past the other robot
     return replace(state, passing=after)
 

@@ -68,11 +68,15 @@ def guaranteed(scenario: Scenario) -> bool:
     fair = fair and not any(one.partition and not (one.ticks or one.contact_ticks) for one in scenario.faults)
     exact = scenario.mission.noise.exact and scenario.world_noise is None and scenario.range_model is None
     honest = all(one.attack is None for one in scenario.robots) and not scenario.deaths
+    free = _apart(scenario) > scenario.mission.safety_distance  # others do not move
+    delivers = fair and scenario.radio_model is None
+    return delivers and exact and honest and free and scenario.planner_name == "assured"
+
+
+def _apart(scenario: Scenario) -> float:
+    """Return the least distance (m) between the starts of two robots; infinite of one robot."""
     starts = [one.start for one in scenario.robots]
-    apart = min([travelled(*two) for two in combinations(starts, 2)], default=math.inf)
-    if scenario.mission.safety_distance and apart <= scenario.mission.sensing_range:
-        return False  # robots that begin in range of each other may block each other
-    return fair and exact and honest and scenario.planner_name == "assured" and scenario.radio_model is None
+    return min([travelled(*two) for two in combinations(starts, 2)], default=math.inf)
 
 
 def blamed(run: Run) -> Iterator[Breach]:
@@ -101,6 +105,8 @@ def bounds(run: Run) -> list[tuple[str, int | None, int]]:
     scenario = run.scenario
     if not guaranteed(scenario) or any(one != Fault() for one in scenario.faults) or run.end is None:
         return []
+    if scenario.mission.safety_distance and _apart(scenario) <= scenario.mission.sensing_range:
+        return []  # robots that begin in range of each other drive aside, for which no bound allows
     found = [(one.visited, one.localised_tick, one.bound_ticks) for one in meeting_results(run)]
     found += [(one.robot, one.localised_tick, one.bound_ticks) for one in search_results(run)]
     if scenario.in_pairs:
