@@ -20,10 +20,11 @@ from agent.planning.state import RobotState
 from agent.planning.tasks import LastManoeuvre
 from compose.launch.in_process import run_mission
 from compose.recording.run import Run
-from compose.scenario.scenario_file import parse
+from compose.scenario.scenario_file import parse, validate
 from protocol.messages import Localised
 from protocol.mission import Mission, infeasibility
 from protocol.motion import ORIGIN, Pose, compose, step
+from tests.missions import outcome
 from tests.series import series
 from tests.steps import Step, steps
 from world.referee import errors
@@ -522,3 +523,25 @@ def test_a_slow_turner_completes_phase_1_next_to_its_anchor(rho0: float) -> None
 @given(st.floats(0.1, 1.5), st.floats(0.05, 1.0), st.floats(0.2, math.pi))
 def test_ordinary_missions_are_feasible(ratio: float, period: float, turn_rate: float) -> None:
     assert infeasibility(Mission(10.0 * ratio, period, 1.0, turn_rate), 10.0) is None
+
+
+def test_a_start_on_the_rim_is_in_range_however_its_distance_is_rounded() -> None:
+    """The ranges of b are computed beside a's anchor, where that of its start is 4e-16 m longer than R."""
+    table = {
+        "name": "rim",
+        "mission": {
+            "sensing_range": 3.0,
+            "period": 1.0,
+            "max_speed": 1.0,
+            "max_turn_rate": math.pi,
+        },
+        "robot": [
+            {"id": "a", "anchor": [0.0, 2.0]},
+            {
+                "id": "b",
+                "anchor": [10.0, 0.0],
+                "start": [11.574364794805687, -2.553698395049119, 5.26548904660247],
+            },
+        ],
+    }
+    assert outcome(run_mission(validate(table, "rim.toml").seeded(1))) == "localised"

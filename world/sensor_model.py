@@ -15,6 +15,9 @@ from world.random_streams import correlated, gaussian, random_walk, uniform
 from world.world_models import Radios, RangeModel
 from world.world_noise import WorldNoise, of_robot
 
+REACH_ROUNDING = 1e-12
+"""The part by which the reach is longer than told: rounding must not put a start on the rim out of range."""
+
 LONGEST_RANGE = 1e7
 """The largest measured range in m, which is the bound of `units.Range`."""
 
@@ -237,7 +240,7 @@ def sensor_model(
         world=world,
         shared=world.is_shared,
         exact=noise.exact and world.is_shared,
-        reach=world.sensing_range_factor * mission.sensing_range,
+        reach=world.sensing_range_factor * mission.sensing_range * (1.0 + REACH_ROUNDING),
         period=mission.period,
         survey={anchor: surveyed(anchor) for anchor in anchors},
         anchors={
