@@ -85,6 +85,12 @@ def test_a_virtual_process_that_is_not_started_again_is_missed(tmp_path: Path) -
     assert (ended.taken, ended.failures) == (1, ["a process that was killed is missing"])
 
 
+def test_frames_on_one_key_arrive_in_order_however_their_times_are_rounded() -> None:
+    """A repeated Observation of tick 0 arrived 1e-18 s after that of tick 1, and counted as refused."""
+    table = {**hunted("random")[0], "seed": 1967196612}
+    assert examined(table).breaches == ()
+
+
 # --- the search ---------------------------------------------------------------------------------------
 
 

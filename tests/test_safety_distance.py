@@ -331,6 +331,29 @@ def test_two_robots_that_begin_near_each_other_are_localised(name: str) -> None:
     assert least >= safety - 1e-9
 
 
+@pytest.mark.parametrize("seed", [2, 12])
+def test_robots_that_noise_has_led_too_near_to_each_other_part(seed: int) -> None:
+    """Two robots of a team stood within three sigmas of the safety distance until the end."""
+    table = {
+        "name": "near",
+        "mission": {
+            "sensing_range": 5.0,
+            "period": 1.0,
+            "max_speed": 0.5,
+            "safety_distance": 0.8,
+            "max_turn_rate": 1.0,
+            "accuracy": 0.2,
+            "frame": "relative",
+            "area": [0.0, 0.0, 6.0, 6.0],
+            "noise": NOISE["noise"],
+        },
+        "team": {"robots": 2, "side": 6.0},
+    }
+    run = of_frames(kept(validate(table, "near.toml").seeded(seed)))
+    assert localised(run) == set(run.robots)
+    assert audit_run(run).violations == ()
+
+
 def test_no_robot_has_to_keep_the_distance_to_a_dead_one_which_it_cannot_range() -> None:
     """Two robots begin 0.45 m apart; after the death of r2, r1 passes it at 0.01 m."""
     table = table_of(5, 0)

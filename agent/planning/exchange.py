@@ -135,7 +135,9 @@ def _safe(state: RobotState, controls: Controls) -> Controls:
         return controls
     if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
         return REST
-    return separation.slowed(controls, separation.leeway_of_each(state.mutual[-1].range, mission), mission)
+    aside = bool(state.passing.places) and tasks.drives_aside(state.task)
+    free = separation.leeway_of_each(state.mutual[-1].range, mission, aside=aside)
+    return separation.slowed(controls, free, mission)
 
 
 class Steps(NamedTuple):

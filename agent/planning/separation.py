@@ -42,9 +42,14 @@ def leeway(rho: float, mission: Mission) -> float:
     return max(0.0, rho - largest_error(mission) - mission.safety_distance)
 
 
-def leeway_of_each(rho: float, mission: Mission) -> float:
-    """Return how far in m each of two robots `rho` m apart may go in any direction, as both may drive."""
-    return SHARE_OF_EACH * leeway(rho, mission)
+def leeway_of_each(rho: float, mission: Mission, *, aside: bool = False) -> float:
+    """Return how far in m each of two robots `rho` m apart may go in any direction, as both may drive.
+
+    On a way `aside`, no error of the range is allowed for: robots that its noise has led too near would stand
+    there for ever.
+    """
+    free = max(0.0, rho - mission.safety_distance) if aside else leeway(rho, mission)
+    return SHARE_OF_EACH * free
 
 
 def slowed(controls: Controls, metres: float, mission: Mission) -> Controls:

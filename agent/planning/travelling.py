@@ -164,10 +164,10 @@ def limited(controls: Controls, passing: Bypass, mission: Mission) -> Controls:
     return separation.slowed(controls, max(0.0, passing.leeway - reserve), mission)
 
 
-def leeway(ranges: Mapping[str, float | None], mission: Mission) -> float:
-    """Return how far in m a robot may drive in the next tick for the robots at these `ranges`."""
-    free = [0.0 if rho is None else separation.leeway_of_each(rho, mission) for rho in ranges.values()]
-    return min(free, default=math.inf)
+def leeway(ranges: Mapping[str, float | None], mission: Mission, *, aside: bool = False) -> float:
+    """Return how far in m a robot may drive in a tick, or `aside`, for the robots at these `ranges`."""
+    known = [0.0 if rho is None else rho for rho in ranges.values()]
+    return min([separation.leeway_of_each(rho, mission, aside=aside) for rho in known], default=math.inf)
 
 
 def passed(
@@ -184,7 +184,7 @@ def passed(
     other, and none is blocked. A blocked robot drives aside, but stands still first for those that come
     `before` it.
     """
-    free = leeway(ranges, mission)
+    free = leeway(ranges, mission, aside=bool(passing.places))
     blocked = passing.blocked + (free <= passing.leeway) if separation.is_tight(free, mission) else 0
     yielded = passing.yielded if math.isfinite(free) else 0
     if blocked < (BLOCKED_ASIDE_AFTER if passing.places else BLOCKED_AFTER) or controls.v == 0.0:
@@ -194,7 +194,7 @@ def passed(
         return replace(passing, leeway=0.0, blocked=blocked, yielded=yielded + 1)
     course = here if controls.v > 0.0 else compose(here, Pose(0.0, 0.0, math.pi))
     places = aside(course, mission, 1.0 if passing.detours % 2 == 0 else -1.0)
-    return Bypass(free, detours=passing.detours + 1, places=places)
+    return Bypass(leeway(ranges, mission, aside=True), detours=passing.detours + 1, places=places)
 
 
 def aside(course: Pose, mission: Mission, side: float) -> tuple[Place, ...]:

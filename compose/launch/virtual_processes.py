@@ -266,12 +266,10 @@ class VirtualNetwork:
         for link, to in self._matching[key]:
             due = self.now + low * (high / low) ** self._draw.random()
             due = self._latest[link, key] = max(due, self._latest.get((link, key), 0.0))
-            self.deliver(link, to, sample, due - self.now)
+            self.deliver(link, to, sample, due)
 
-    def deliver(
-        self, link: VirtualLink, to: Callable[[_Sample], None], sample: _Sample, delay: float
-    ) -> None:
-        """Give `sample` to a subscriber of `link` after `delay` s, and let its process run."""
+    def deliver(self, link: VirtualLink, to: Callable[[_Sample], None], sample: _Sample, due: float) -> None:
+        """Give `sample` to a subscriber of `link` at the time `due` in s, and let its process run."""
 
         def arrive() -> None:
             if link.process.link is link:
@@ -282,7 +280,7 @@ class VirtualNetwork:
                 to(sample)
                 self._woken[link.process] = None
 
-        self.at(self.now + delay, arrive)
+        self.at(due, arrive)
 
     def subscribe(
         self, link: VirtualLink, key: str, to: Callable[[_Sample], None], *, tokens: bool = False
@@ -292,7 +290,7 @@ class VirtualNetwork:
         self._matching.clear()
         for _, shown in list(self.tokens) if tokens else ():
             if zenoh.KeyExpr(key).intersects(zenoh.KeyExpr(shown)):
-                self.deliver(link, to, _Sample(shown, zenoh.ZBytes(b"")), LATENCIES_S[0])
+                self.deliver(link, to, _Sample(shown, zenoh.ZBytes(b"")), self.now + LATENCIES_S[0])
 
     def show(self, link: VirtualLink, key: str, *, gone: bool = False, delay: float = LATENCIES_S[0]) -> None:
         """Show the liveliness token `key` of `link` to others, or withdraw it. One of several is none."""
@@ -302,7 +300,7 @@ class VirtualNetwork:
         kind = zenoh.SampleKind.DELETE if gone else zenoh.SampleKind.PUT
         for other, keys, to in self.watchers:
             if keys.intersects(zenoh.KeyExpr(key)):
-                self.deliver(other, to, _Sample(key, zenoh.ZBytes(b""), kind), delay)
+                self.deliver(other, to, _Sample(key, zenoh.ZBytes(b""), kind), self.now + delay)
 
     def close(self, link: VirtualLink | None, delay: float = NOTICE_S) -> None:
         """Remove the subscriptions and tokens of `link`, which others see after `delay` s."""
