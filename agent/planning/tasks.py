@@ -168,9 +168,9 @@ class Travelling(msgspec.Struct, frozen=True):
 def drives_aside(task: object) -> bool:
     """Return whether a robot at this task drives aside if another one blocks it (see `travelling`).
 
-    In phase 1, a straight that is blocked is left for the next step of the search.
+    A straight of phase 1 that is blocked is left for the next step of the search.
     """
-    on_its_way = isinstance(task, Orbital | Travelling | Circling)
+    on_its_way = isinstance(task, Orbital | Travelling | Homing | Circling)
     return on_its_way or (isinstance(task, Surveying) and task.beacon == "anchor")
 
 

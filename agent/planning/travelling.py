@@ -21,7 +21,7 @@ from msgspec.structs import replace
 from agent.planning import drive, phase2_orbit, separation
 from agent.planning.drive import way_to
 from agent.planning.state import Bypass, RobotState
-from agent.planning.tasks import Measuring, Orbiting, Travelling, drives_aside, transformed
+from agent.planning.tasks import Homing, Measuring, Orbiting, Travelling, drives_aside, transformed
 from protocol.coverage_strips import Place
 from protocol.messages import Contact
 from protocol.mission import Mission
@@ -137,7 +137,7 @@ def onward(state: RobotState, contacts: Sequence[Contact]) -> RobotState:
     if not mission.safety_distance:
         return state
     is_aside = drives_aside(task) and not (isinstance(task, Orbiting) and state.config.orbit.v == 0.0)
-    seeks = is_aside and isinstance(task, Measuring)  # it does not plan with the place of its peer
+    seeks = is_aside and isinstance(task, Measuring | Homing)  # it does not plan with the place of its peer
     met = state.config.peer if state.in_contact and not seeks else None
     ranges = {one.peer: one.range for one in contacts if one.peer != met}
     if not is_aside:
