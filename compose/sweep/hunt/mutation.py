@@ -393,7 +393,8 @@ def _fields(table: Mapping[str, Any]) -> Iterator[tuple[tuple[str, ...], Any]]:
         if name in LISTS:
             yield from [((name, repr(row)), True) for row in part]
         elif isinstance(part, list):
-            yield from [((name, row["id"], field), value) for row in part for field, value in row.items()]
+            rows = [(str(i), row) for i, row in enumerate(part)]  # another id is one change
+            yield from [((name, i, field), value) for i, row in rows for field, value in row.items()]
         elif isinstance(part, dict):
             yield from [((name, field), value) for field, value in part.items()]
         elif name not in ("name", "seed"):
