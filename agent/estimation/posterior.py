@@ -96,8 +96,11 @@ PAIR = (0, 1)
 def hypotheses_of(found: Sequence[Fit], measured: JointMeasurements) -> tuple[Hypothesis, ...]:
     """Return the hypotheses for fits to what was `measured`, likeliest first, without duplicates.
 
-    Improbable ones are dropped.
+    Improbable ones are dropped. With exact sensors, so are fits that have not converged, if others have:
+    their linear models explain ranges that they do not fit.
     """
+    if measured.only_rounding:
+        found = [one for one in found if one.last_step <= FINISHED] or found
     detections = detection_log_likelihoods(found, measured)
     weighed = [
         (one.weight + max(seen, LEAST_EVIDENCE), one, seen)

@@ -36,6 +36,9 @@ ARRIVED = 0.01
 LOOPS_UNTIL_RETURN = 3
 """The time, in loops, for which a robot drives to where it expects a range before it returns."""
 
+LAPS_UNTIL_RETURN = 2
+"""The laps without any range after which the anchor is not where it seemed to be. The robot returns to it."""
+
 MANY_RETURNS = 2
 """The number of returns to a contact after which what the robot does there has led away too often.
 
@@ -180,10 +183,12 @@ def _lost(state: TeamState) -> Pose | None:
         beacon = max(state.nearest, key=lambda one: (one.range < math.inf, one.latest))
     if beacon.range == math.inf or state.config.robot == team.origin:
         return None
-    waits = LOOPS_UNTIL_RETURN * loop_ticks(state.config.mission, state.own) if state.doing != "homing" else 0
-    if state.tick <= beacon.latest + waits or (state.place is None and state.doing != "homing"):
-        return None
-    return beacon.place
+    waits = 0.0
+    if state.doing != "homing" and state.place is not None:
+        waits = LOOPS_UNTIL_RETURN * loop_ticks(state.config.mission, state.own)
+    elif state.doing != "homing":
+        waits = LAPS_UNTIL_RETURN * _lap_ticks(state, state.way) if state.way is not None else math.inf
+    return beacon.place if state.tick > beacon.latest + waits else None
 
 
 def _circling(state: TeamState) -> TeamState:
@@ -271,10 +276,15 @@ def _way(state: TeamState) -> Way | None:
     return Way(Pose(-start[0], -start[1], 0.0), orbit, since)
 
 
+def _lap_ticks(state: TeamState, way: Way) -> float:
+    """Return the ticks of a lap, with some for the way to it."""
+    return 1.25 * TAU / (state.config.mission.period * way.orbit.omega)
+
+
 def _along(state: TeamState, way: Way) -> Controls:
     """Return the controls that lead to the way and along it. Each lap is aside of the last one."""
     mission, orbit = state.config.mission, way.orbit
-    lap = int((state.tick - way.since) * mission.period * orbit.omega / (1.25 * TAU))
+    lap = int((state.tick - way.since) / _lap_ticks(state, way))
     radius = max(orbit.radius + LAPS[lap % len(LAPS)] * mission.sensing_range, 0.3 * mission.sensing_range)
     omega = min(mission.max_turn_rate, mission.max_speed / radius)
     local = Pose(state.odometry.x - way.centre.x, state.odometry.y - way.centre.y, state.odometry.heading)

@@ -128,8 +128,9 @@ def refined(guesses: Array, robot: JointMeasurements) -> list[Array]:
         change = solve(information, product(weighted, residuals[..., None]))[..., 0]
         guesses = guesses + change / np.maximum(np.max(np.abs(change) / most, 1, keepdims=True), 1.0)
     distance, _ = predicted(guesses, at, ranges.place)
-    likely = log_likelihood(ranges.rho - distance, hypot(sigma, FINAL * longest), robot.noise)
-    return _distinct(guesses, likely, at, longest)
+    share = OF_EXACT if robot.only_rounding else 1.0
+    likely = log_likelihood(ranges.rho - distance, hypot(sigma, share * FINAL * longest), robot.noise)
+    return _distinct(guesses, likely, at, share * APART * longest)
 
 
 def predicted(guesses: Array, at: Array, place: Array) -> tuple[Array, Array]:
@@ -158,9 +159,12 @@ LONGEST_STEP, LARGEST_TURN = 0.2, 0.3
 FINAL = 0.02
 """The error of a prediction without a correction of the odometry, as a fraction of the longest range."""
 
+OF_EXACT = 0.02
+"""The part of FINAL and APART with exact sensors: two poses that explain three ranges may be nearly one."""
 
-def _distinct(guesses: Array, likely: Array, at: Array, longest: float) -> list[Array]:
-    """Return the likeliest of `guesses` at different poses at the end of the path `at` (m).
+
+def _distinct(guesses: Array, likely: Array, at: Array, apart: float) -> list[Array]:
+    """Return the likeliest of `guesses` that end `apart` (m) on the path `at` (m), or on other headings.
 
     Headings count only as far as they move the path: those of a robot that stands would leave out the mirror
     image of its place.
@@ -175,6 +179,6 @@ def _distinct(guesses: Array, likely: Array, at: Array, longest: float) -> list[
         best = int(left[0])
         chosen.append(guesses[best])
         turn = np.remainder(guesses[left, 2] - guesses[best, 2] + math.pi, math.tau) - math.pi
-        far = hypot(*(ends[left] - ends[best]).T) > APART * longest
-        left = left[far | ((np.abs(turn) > TURNED) & (np.abs(turn) * extent > APART * longest))]
+        far = hypot(*(ends[left] - ends[best]).T) > apart
+        left = left[far | ((np.abs(turn) > TURNED) & (np.abs(turn) * extent > apart))]
     return chosen

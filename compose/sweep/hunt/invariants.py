@@ -124,9 +124,13 @@ def late(run: Run) -> Iterator[Breach]:
 
 
 def truth_lost(run: Run) -> Iterator[Breach]:
-    """The true pose is one of a robot's hypotheses, with exact sensors and honest peers."""
+    """The true pose is one of a robot's hypotheses, with exact sensors and honest peers.
+
+    In a team, the first ranges of a robot may leave its heading open, or have two poses that are nearly one.
+    """
     scenario = run.scenario
-    if not scenario.mission.noise.exact or any(one.attack is not None for one in scenario.robots):
+    honest = all(one.attack is None for one in scenario.robots)
+    if not (scenario.mission.noise.exact and honest and scenario.team is None):
         return
     for place, robot in enumerate(scenario.robots):
         for estimate in run.estimates(robot.id):
