@@ -30,7 +30,7 @@ from compose.launch.in_process import run_mission
 from compose.recording.run import of_frames, read
 from compose.recording.summary_json import summary
 from compose.scenario.scenario_change import file_table
-from compose.scenario.scenario_file import load, parse, template_of, validate
+from compose.scenario.scenario_file import load, parse, scenario_table, template_of, validate
 from compose.scenario.shipped_files import shipped
 from compose.sweep.group_columns import group_columns
 from protocol.journal.journal_file import CorruptJournal
@@ -234,6 +234,16 @@ def test_robots_ask_for_rivals_of_their_claims_only_when_the_survey_has_ended(
     run = run_mission(to_a_sigma(0.05, load("survey")))
     claims = [made for robot in run.robots if (made := run.standing_claim(robot)) is not None]
     assert asked == [tick for tick, _ in claims]
+
+
+def test_a_robot_goes_to_one_that_has_ranged_the_anchor_that_it_does_not_know() -> None:
+    """Late reports left b with a few ranges of a to two anchors, when a had its claim: 1 455 ticks."""
+    table = scenario_table("survey")
+    table["mission"]["noise"] = {"anchor_sigma": 0.0, "mutual_sigma": 0.0}
+    table |= {"seed": 1, "fault": [{"link": "*", "duplicate": 0.7, "delay": [0, 3]}]}
+    run = run_mission(validate(table, "late.toml").scenario)
+    assert outcome(run) == "localised"
+    assert run.length < 30
 
 
 def test_a_survey_says_where_each_anchor_stands_and_by_how_much_that_may_be_off(tmp_path: Path) -> None:

@@ -310,19 +310,22 @@ def _surveying(state: TeamState) -> TeamState | None:
 def _to_anchor(state: TeamState) -> Controls | None:
     """Return the controls to where the robot was nearest to an anchor that too few ranges locate.
 
-    None if it has no such anchor, or is in range of it, or there.
+    If it has never ranged that anchor, it goes to where it was nearest to a robot that has. None if it has no
+    such anchor, or is in range of it, or there.
     """
-    part, names = state.following.part, [one.id for one in state.team.anchors]
-    for name in state.wanted:
-        near = state.nearest[len(state.team.robots) + names.index(name)]
-        if (
-            part is not None
-            and name not in part.robots
-            and near.latest < state.tick
-            and near.range < math.inf
-        ):
+    names, robots = [one.id for one in state.team.anchors], state.team.robots
+    located = state.following.part.robots if state.following.part is not None else ()
+    for name in [one for one in state.wanted if one not in located]:
+        anchor = names.index(name)
+        of_robots = [state.nearest[k] for k in range(len(robots)) if _has_ranged(state, k, anchor)]
+        near = min([state.nearest[len(robots) + anchor], *of_robots], key=lambda one: one.range == math.inf)
+        if near.latest < state.tick and near.range < math.inf:
             return towards((near.place.x, near.place.y), state.odometry, state.config.mission, ARRIVED)
     return None
+
+
+def _has_ranged(state: TeamState, robot: int, anchor: int) -> bool:
+    return any(one.to == anchor for entry in state.log.logs[robot] for one in entry.anchors)
 
 
 def _seen(state: TeamState) -> list[AmongBeacons]:
