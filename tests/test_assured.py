@@ -7,7 +7,7 @@ from collections.abc import Callable, Iterator
 from functools import cache
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import pytest
 from hypothesis import given
@@ -525,23 +525,28 @@ def test_ordinary_missions_are_feasible(ratio: float, period: float, turn_rate: 
     assert infeasibility(Mission(10.0 * ratio, period, 1.0, turn_rate), 10.0) is None
 
 
+def near(a: tuple[float, ...], b: tuple[float, ...], **more: Any) -> dict[str, Any]:
+    """Return a scenario file of Section IV's robots with these anchors (x, y), or with starts behind them."""
+    robots = [
+        {"id": name, "anchor": place[:2], **({"start": place[2:]} if place[2:] else {})}
+        for name, place in (("a", a), ("b", b))
+    ]
+    mission = {"sensing_range": 3.0, "period": 1.0, "max_speed": 1.0, "max_turn_rate": math.pi}
+    return {"name": "near", "mission": mission, "robot": robots, **more}
+
+
 def test_a_start_on_the_rim_is_in_range_however_its_distance_is_rounded() -> None:
     """The ranges of b are computed beside a's anchor, where that of its start is 4e-16 m longer than R."""
-    table = {
-        "name": "rim",
-        "mission": {
-            "sensing_range": 3.0,
-            "period": 1.0,
-            "max_speed": 1.0,
-            "max_turn_rate": math.pi,
-        },
-        "robot": [
-            {"id": "a", "anchor": [0.0, 2.0]},
-            {
-                "id": "b",
-                "anchor": [10.0, 0.0],
-                "start": [11.574364794805687, -2.553698395049119, 5.26548904660247],
-            },
-        ],
-    }
+    rim = (11.574364794805687, -2.553698395049119, 5.26548904660247)
+    table = near((0.0, 2.0), (10.0, 0.0, *rim))
     assert outcome(run_mission(validate(table, "rim.toml").seeded(1))) == "localised"
+
+
+def test_a_goes_back_to_its_orbit_if_b_has_driven_on_before_it_knew_of_the_encounter() -> None:
+    """With late reports, a drove round and round where it had met b, until the end."""
+    a = (0.0, 0.0, -2.3115737408470753, -1.541049160564716, 0.587998183252111)
+    b = (3.0, 2.0, 0.5192954351147141, 0.3461969567431429, -2.5535900500422257)
+    table = near(a, b, fault=[{"delay": [1, 7]}])
+    run = run_mission(validate(table, "late.toml").seeded(390243780))
+    assert outcome(run) == "localised"
+    assert run.length < 60

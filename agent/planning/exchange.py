@@ -187,8 +187,7 @@ class LogPlanner(Planner[RobotState, Report]):
             case tasks.Orbital():
                 return self._steps(state).phase2(state, task, ranged)
             case tasks.Searching("peer"):
-                seeking = range_seeking.onward(state, task, state.in_contact, self.MANOEUVRES)
-                return state.doing(seeking or tasks.Waiting())
+                return phase3_encounter.sought(state, task, self.MANOEUVRES)
             case tasks.Searching():
                 seeking = range_seeking.onward(state, task, ranged, self.MANOEUVRES)
                 return state.doing(seeking) if seeking else self._steps(state).phase1(state, self.MANOEUVRES)

@@ -16,6 +16,7 @@ from agent.planning import phase2_orbit, phase3_last_manoeuvre, range_seeking, t
 from agent.planning.active_sensing import CONTINUED, next_objective, plan_together
 from agent.planning.drive import step_length
 from agent.planning.phase3_last_manoeuvre import Plan, Question
+from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
 from protocol.messages import Localised
@@ -59,6 +60,17 @@ def _may_drive_straight(state: RobotState) -> bool:
     peer = state.peer_state
     stands = peer.peer.through == state.tick or peer.state == tasks.Standing.name
     return stands and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
+
+
+def sought(state: RobotState, task: tasks.Searching, manoeuvres: Manoeuvres) -> RobotState:
+    """Return `state` after a tick of a's search for its second mutual range.
+
+    If a does not find b all around, b has driven on: its reports were late. a goes back to its orbit.
+    """
+    if not state.in_contact and range_seeking.has_come_round(task, state.odometry):
+        return state.doing(phase2_orbit.aligning(state))
+    seeking = range_seeking.onward(state, task, state.in_contact, manoeuvres)
+    return state.doing(seeking or tasks.Waiting())
 
 
 def after_last_manoeuvre(state: RobotState, task: tasks.LastManoeuvre | tasks.Returning) -> RobotState:

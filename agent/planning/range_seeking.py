@@ -17,7 +17,7 @@ from agent.planning.planner import Manoeuvres
 from agent.planning.state import RobotState
 from agent.planning.strides import stride
 from agent.planning.tasks import Backing, Circling, Homing, Searching, Straight, Turning
-from protocol.motion import ORIGIN, Pose, inverse, relative, travelled
+from protocol.motion import ORIGIN, TAU, Pose, inverse, relative, travelled
 from protocol.team_motion import next_on_spiral
 
 
@@ -48,6 +48,11 @@ def onward(state: RobotState, task: Searching, measured: bool, manoeuvres: Manoe
             # where another robot has blocked all ways so far, a range beside the origin tells no direction
             has_moved = not separation.is_tight(travelled(task.origin, pose), state.config.mission)
             return None if measured and has_moved else task
+
+
+def has_come_round(task: Searching, pose: Pose) -> bool:
+    """Return whether the robot has driven its circle all around: it began 90 degrees to either side."""
+    return isinstance(task, Circling) and pose.heading - task.origin.heading > 1.25 * TAU
 
 
 def is_blocked(state: RobotState) -> bool:
