@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from agent.planning.phase3_last_manoeuvre import Array, Compared, Plan, compared
 from agent.planning.tasks import LastManoeuvre
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import ANCHORS, LABEL, NO_ENCOUNTER, Absent, Sheet, circle, entry, heading, trace
+from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, Absent, Sheet, circle, entry, heading, trace
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
 from protocol.mission import ROLES, Mission, Role
@@ -87,7 +87,7 @@ def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     axes, value = sheet.panels["plane"], sheet.panels["value"]
     away = [travelled(seen.mover, other) for other in seen.others]
     half = WINDOW_MARGIN * max(mission.max_speed * mission.period, *away)
-    _hypotheses(axes, pair, one, seen, half)
+    _hypotheses(sheet, pair, one, seen, half)
     _reach(axes, pair, plan, seen, ways)
     x, y = seen.mover.x, seen.mover.y
     sheet.plane("plane", (x - half, x + half, y - half, y + half))
@@ -110,9 +110,10 @@ def _title(pair: PairRecord, one: Planned) -> str:
     return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {hypotheses}; {chosen}{value}"
 
 
-def _hypotheses(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
+def _hypotheses(sheet: Sheet, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
     """Draw where each hypothesis has the other robot, the last range, and the bisectors of all pairs."""
-    other, x, y = OTHER[one.plan.question.mover], seen.mover.x, seen.mover.y
+    axes, other = sheet.panels["plane"], OTHER[one.plan.question.mover]
+    x, y = seen.mover.x, seen.mover.y
     for (i, p), (j, q) in combinations(enumerate(seen.others, start=1), 2):
         apart = travelled(p, q)
         if apart > 0.0:
@@ -129,15 +130,12 @@ def _hypotheses(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
         label = f"last range, {rho:.4f} m"
         circle(axes, (x, y), rho, ls=(0, (5, 3)), lw=1.0, color="k", gid="rho", label=label)
     end = step(seen.mover, one.plan.command.v, one.plan.command.omega, pair.mission.period)
-    text: Any = {"textcoords": "offset points", "ha": "center", "va": "center", "zorder": 6, "bbox": LABEL}
     for i, place in enumerate(seen.others, start=1):
-        away = travelled(seen.mover, place) or 1.0
         trace(
             axes, [place], ROLE_MARKERS[other]["marker"], ms=7, mfc=COLOURS[other], mec="white", mew=0.6,
             gid=f"hypothesis-{i}", zorder=5, label=f"{i}: predicted range {travelled(end, place):.4f} m",
         )  # fmt: skip
-        beside = -13 * (place.x - x) / away, -13 * (place.y - y) / away
-        axes.annotate(str(i), (place.x, place.y), xytext=beside, **text)
+        sheet.label(str(i), (place.x, place.y))
     entry(axes, _after(pair, one), ls="")
 
 
