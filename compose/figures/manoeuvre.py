@@ -17,6 +17,7 @@ from compose.figures.pair import PairRecord
 from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, Absent, Sheet, circle, entry, heading, trace
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
+from compose.view.events import with_minus
 from protocol.mission import ROLES, Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, inverse, rotated, step, travelled
 
@@ -103,7 +104,8 @@ def _title(pair: PairRecord, one: Planned) -> str:
     plan, mover = one.plan, one.plan.question.mover
     robot, own = pair.robot(mover).id, plan.question.a == ORIGIN == plan.question.b
     frame = f"{robot}'s own frame" if own else rf"$\langle\,{mover}({ANCHORS[mover]})\rangle$"
-    chosen = rf"$v_2$ = {plan.command.v:g} m/s, $\omega_2$ = {plan.command.omega:+.4f} rad/s"
+    speed, turn = with_minus(f"{plan.command.v:g}"), with_minus(f"{plan.command.omega:+.4f}")
+    chosen = rf"$v_2$ = {speed} m/s, $\omega_2$ = {turn} rad/s"
     count = len(plan.question.placements)
     hypotheses = f"{count} hypotheses" if count > 1 else "1 hypothesis, to be checked"
     value = f", $J$ = {plan.separation_m2:.5g} m$^2$" if plan.separation_m2 is not None else ""
@@ -158,7 +160,7 @@ def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: 
             axes.plot(*seen.turned(x, y), "-", lw=0.7, color=PALER, zorder=1.5, gid=gid, label=label)
             label = None
     v, ends = float(ways.reach.v[chosen, 0]), seen.turned(ways.reach.x[chosen], ways.reach.y[chosen])
-    label = f"reachable with $v_2$ = {v:g} m/s"
+    label = f"reachable with $v_2$ = {with_minus(f'{v:g}')} m/s"
     axes.plot(*ends, "-", lw=2.0, color="k", zorder=2, gid="reach", label=label)
     times = [period * i / ARC_SEGMENTS for i in range(ARC_SEGMENTS + 1)]
     poses = [step(seen.mover, plan.command.v, plan.command.omega, time) for time in times]
