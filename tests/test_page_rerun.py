@@ -233,7 +233,7 @@ def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open,
     page = opened_form(opened, address)
     start = PAPER_1.robots[0].start
     drag(page, (start.x, start.y), (1.0, 2.0))
-    x, y = (float(page.get_by_label(f"start {axis}", exact=True).input_value()) for axis in "xy")
+    x, y = (float(page.get_by_label(f"start {axis} in m", exact=True).input_value()) for axis in "xy")
     assert (x, y) == pytest.approx((1.0, 2.0), abs=0.05)
     page.get_by_role("button", name="run", exact=True).click()
     expect(page.locator("#title")).to_have_text("paper-1-changed")

@@ -46,7 +46,7 @@ ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
 """The anchors' names in the paper, for use between two `$`."""
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 """The background of a text within a panel."""
-GAPS, DIRECTIONS = (5.0, 11.0, 18.0), 16
+GAPS, DIRECTIONS = (4.0, 9.0, 14.0), 16
 """The distances in points from a point to its label, and the number of directions, that are compared."""
 LINES = {"-": "solid", "--": "dashed", "-.": "dash-dotted", ":": "dotted"}
 MARKERS = {
@@ -151,22 +151,22 @@ class Sheet:
         axes, points = self.panels["plane"], self.figure.dpi / 72.0
         axes.apply_aspect()
         artists: list[Line2D | Patch] = [*axes.lines, *axes.patches]
-        paths = [one.get_transform().transform_path(one.get_path()) for one in artists]
+        drawn = [one.get_transform().transform_path(one.get_path()) for one in artists]
+        extents = [path.get_extents() for path in drawn]
         frame, placed = axes.bbox.padded(-points), list[Bbox]()
         for text, radius in self._labels:
-            (x, y), extent = axes.transData.transform(text.xy), text.get_window_extent()
-            away, least = axes.transData.transform((text.xy[0] + radius, text.xy[1]))[0] - x, math.inf
+            extent, least = text.get_window_extent(), math.inf
+            away = math.dist(*axes.transData.transform([text.xy, (text.xy[0] + radius, text.xy[1])]))
+            area = extent.padded(away + GAPS[-1] * points + extent.width)
+            paths = [path for path, box in zip(drawn, extents, strict=True) if area.overlaps(box)]
             for gap, turn in product(GAPS, range(DIRECTIONS)):
                 angle = 0.5 * math.pi + 2.0 * math.pi * turn / DIRECTIONS
                 right = (away + gap * points + 0.5 * extent.width) * math.cos(angle)
                 up = (away + gap * points + 0.5 * extent.height) * math.sin(angle)
-                box = extent.translated(
-                    x + right - 0.5 * (extent.x0 + extent.x1), y + up - 0.5 * (extent.y0 + extent.y1)
-                )
+                box = extent.translated(right, up)
+                blocked = box.count_overlaps(placed) + (frame.count_contains(box.corners()) < 4)
                 crossed = sum([path.intersects_bbox(box.padded(points), filled=False) for path in paths])
-                crossed += len(paths) * (
-                    box.count_overlaps(placed) + (frame.count_contains(box.corners()) < 4)
-                )
+                crossed += len(drawn) * blocked
                 if crossed < least:
                     least, best = crossed, box
                     text.set_position((right / points, up / points))
