@@ -39,7 +39,7 @@ def estimated_path(recording: RangeRecording, robot: str, window: Window, accura
     measured = measurements(recording, [robot], None, window)
     fitted = estimated(measured, ClaimRule(accuracy)).epochs[-1].fitted
     if fitted is None:
-        raise UserError(f"{recording.source}: without an anchor, {robot} is not located")
+        raise UserError(f"{recording.source}: without an anchor, {robot} has no pose")
     path, origin = fitted.fit.paths[0], fitted.used.origin
     times = measured.time_of(np.arange(len(path)))
     return np.column_stack((times, path[:, 0] + origin[0], path[:, 1] + origin[1]))

@@ -145,6 +145,9 @@ def test_what_is_no_recording_is_refused_with_the_formats(tmp_path: Path) -> Non
     assert refused(tmp_path / "notes.txt").startswith(f"{tmp_path}/notes.txt: {formats}")
     assert refused(tmp_path).startswith(f"{tmp_path}: {formats}")
     (tmp_path / "uwb.csv").write_text("t,from,to,range\n")
+    assert refused(tmp_path / "uwb.csv").endswith(
+        "/uwb.csv: name the folder that it is in, with ranges.csv and odometry.csv or poses.csv"
+    )
     assert refused(tmp_path).endswith(", or a recording of Tandem; it has uwb.csv")
     assert (
         refused(tmp_path / "none.pyfg") == f"{tmp_path}/none.pyfg cannot be read: No such file or directory"

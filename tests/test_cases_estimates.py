@@ -73,13 +73,10 @@ def metres(tmp_path_factory: pytest.TempPathFactory) -> Path:
 # --- units ------------------------------------------------------------------------------------------------
 
 
-def test_ranges_in_mm_are_suspected_early_and_nothing_is_claimed(tmp_path: Path) -> None:
+def test_ranges_in_mm_are_refused_in_one_line_and_the_api_says_why_nothing_is_claimed(tmp_path: Path) -> None:
     ended = tandem("estimate", MILLIMETRES, "--out", "found", cwd=tmp_path)
-    assert (ended.status, ended.err) == (NOT_LOCALISED, "")
-    assert f"no claim at the end: {IN_MM}" in ended.out
-    summary = json.loads((tmp_path / "found" / "estimate.json").read_text())
-    assert summary["blocking_reason"] == IN_MM
-    assert [one["first_claim"] for one in summary["robots"].values()] == [None, None]
+    assert ended == (USER_ERROR, "", f"tandem estimate: {MILLIMETRES}: {IN_MM}\n")
+    assert not (tmp_path / "found").exists()
     begun = time.process_time()
     assert api.estimate(MILLIMETRES).summary.blocking_reason == IN_MM
     assert time.process_time() - begun < MOST_S

@@ -422,7 +422,7 @@ def test_the_legend_lists_only_the_marks_that_are_drawn(opened: Open, address: s
         ("where b could drive", {47}),
         ("a pose (place and heading) that a robot may have", {1}),
         ("range between robots: 3\u00a0m", {46}),
-        ("anchor (beacon); range 3\u00a0m", set(ticks)),
+        ("anchor; sensing range 3\u00a0m", set(ticks)),
         ("manoeuvre chosen by b", {47}),
         ("robot a", set(ticks)),
     ):

@@ -401,7 +401,7 @@ def test_a_robot_without_ranges_to_the_frame_has_no_pose_and_says_why() -> None:
     assert [measured.robots[one] for one in found.located] == ["r00", "r01"]
     u, w = [undetermined(measured.robots.index(name), found.located, measured) for name in "uw"]
     assert u == "no range connects it with r00, in whose frame poses are estimated"
-    assert w == "1 of 3 required ranges to located robots"
+    assert w == "1 of 3 required ranges to robots with a pose"
 
 
 @pytest.mark.long

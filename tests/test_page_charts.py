@@ -31,7 +31,7 @@ from tests.test_page import frames_to
 
 CHARTS = "#strips canvas + canvas"
 """The canvas with the cursor, which takes the pointer and has the values as its label."""
-INSET = (46, 8)
+INSET = (54, 8)
 """The space left and right of the curves in their column, in pixels."""
 DRAWN = """(canvas) => {
   const style = getComputedStyle(document.documentElement);

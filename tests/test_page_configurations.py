@@ -124,7 +124,7 @@ def test_the_predicted_distances_and_their_least_difference_are_listed(opened: O
             "4: 3.06 m",
             "nearest two differ by 0.31 m",
             "J over turn rate: 1.80\u00a0m² at +0.91 rad/s "
-            "J over the turn rate from -3.1 to 3.1 rad/s; chosen: 0.91 rad/s, 1.80 m²",
+            "J over the turn rate from \N{MINUS SIGN}3.1 to 3.1 rad/s; chosen: +0.91 rad/s, 1.80 m²",
         ]
     )
     page.keyboard.press("ArrowLeft")

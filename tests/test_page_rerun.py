@@ -203,7 +203,7 @@ def opened_form(opened: Open, address: str, **window: Any) -> Page:
     page = opened(f"{address}#show=paper-1&tick=0", **window)
     until_loaded(page)
     page.keyboard.press("e")
-    expect(page.get_by_label("start x", exact=True)).to_have_value(str(PAPER_1.robots[0].start.x))
+    expect(page.get_by_label("start x in m", exact=True)).to_have_value(str(PAPER_1.robots[0].start.x))
     return page
 
 
@@ -233,7 +233,7 @@ def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open,
     page = opened_form(opened, address)
     start = PAPER_1.robots[0].start
     drag(page, (start.x, start.y), (1.0, 2.0))
-    x, y = (float(page.get_by_label(f"start {axis}", exact=True).input_value()) for axis in "xy")
+    x, y = (float(page.get_by_label(f"start {axis} in m", exact=True).input_value()) for axis in "xy")
     assert (x, y) == pytest.approx((1.0, 2.0), abs=0.05)
     page.get_by_role("button", name="run", exact=True).click()
     expect(page.locator("#title")).to_have_text("paper-1-changed")
@@ -243,7 +243,7 @@ def test_a_start_that_is_dragged_is_where_the_mission_begins_again(opened: Open,
     assert name is not None
     [scene] = fetched(address, f"shows/changed%20{name[2]}/scenes?from=0&to=0")["scenes"]
     assert scene["players"][0]["pose"][:2] == [x, y]
-    expect(page.get_by_label("start x", exact=True)).to_have_value(f"{x:g}")  # ready for the next change
+    expect(page.get_by_label("start x in m", exact=True)).to_have_value(f"{x:g}")  # ready for the next change
     older = opened(f"{address}#tick=7")  # from when there was one mission
     expect(older.locator("#title")).to_have_text("paper-1")
     until_shown(older, 7)
@@ -309,7 +309,7 @@ def test_an_empty_field_and_what_the_server_refuses_run_nothing(opened: Open, ad
         route.fulfill(status=200, content_type="application/json", body=refused.value.read())
 
     page.route(re.compile("/changed$"), refuse)
-    field = page.get_by_label("start x", exact=True)
+    field = page.get_by_label("start x in m", exact=True)
     for empty_or_not in ("", "5"):
         field.fill(empty_or_not)
         field.press("Enter")
@@ -330,7 +330,7 @@ def test_in_a_narrow_window_the_handles_stay_in_view_while_the_form_is_scrolled(
         expect(page.locator("#canvas")).to_be_in_viewport(ratio=1.0)
         assert one.evaluate(ON_TOP)
     drag(page, (start.x, start.y), (1.0, 2.0))
-    assert float(page.get_by_label("start x", exact=True).input_value()) == pytest.approx(1.0, abs=0.1)
+    assert float(page.get_by_label("start x in m", exact=True).input_value()) == pytest.approx(1.0, abs=0.1)
 
 
 @pytest.mark.long

@@ -235,12 +235,12 @@ def test_an_axis_of_the_api_is_paired_as_the_caller_says_and_no_other_is_compare
         shown = capsys.readouterr().out
         assert shown.count("assured - paper") == 2 * each[1]
         apart = [name for name, one in zip(axes, each, strict=True) if not one]
-        assert ("other draws at each value of " + ", ".join(apart) in shown) == bool(apart)
+        assert ("other random draws at each value of " + ", ".join(apart) in shown) == bool(apart)
         for place, one in enumerate(each):
             ticks = axis_figures.STATISTICS["ticks"]
             points = axis_figures.points(results.results, place, ticks)
             label = axis_figures.over_axis(results.sweep, place, ticks, points).axes[0].get_xlabel()
-            assert label.endswith("(other draws at each value)") == (not one)
+            assert label.endswith("(other random draws at each value)") == (not one)
     with pytest.raises(tandem.UserError, match=r"paired: 'mission\.period' is none of the axes fault"):
         tandem.sweep("random", axes, paired=["fault[0].loss", "mission.period"])
     with pytest.raises(tandem.UserError, match="paired: it needs axes"):
@@ -255,7 +255,7 @@ def test_the_command_compares_paired_cells_and_says_which_are_not(tmp_path: Path
     (tmp_path / "s.toml").write_text(text)
     shown = command("sweep", "s.toml", "--out", "paired", cwd=tmp_path).out
     assert shown.count("paper - assured") == 2
-    assert "not paired: trials have other draws at each value of mission.max_speed, so" in shown
+    assert "not paired: trials have other random draws at each value of mission.max_speed, so" in shown
     (tmp_path / "s.toml").write_text(text + "paired = false\n")
     shown = command("sweep", "s.toml", "--out", "apart", cwd=tmp_path).out
     assert "difference" not in shown

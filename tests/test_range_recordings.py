@@ -475,7 +475,7 @@ def test_times_in_ms_are_named(unit: float, tmp_path: Path) -> None:
     rows = track(headings="unwrapped", begin=ORIGIN)
     tables = {"poses": [row | {"t": unit * float(str(row["t"]))} for row in rows]}
     tables |= {"anchors": TABLES["anchors"], "ranges": TABLES["ranges"][1:]}
-    assert refused(written_csv(tmp_path, tables)).endswith("are times in ms? They have to be in s")
+    assert refused(written_csv(tmp_path, tables)).endswith("are times in ms or ns? They have to be in s")
 
 
 def test_a_robot_that_stands_may_say_so_rarely(tmp_path: Path) -> None:
@@ -526,7 +526,7 @@ def test_poses_hours_apart_are_a_jump_and_poses_among_increments_are_named(tmp_p
     (a,) = read_ranges(written_csv(tmp_path, tables)).robots
     assert [one.why for one in a.jumps] == [
         f"{tmp_path}/poses.csv, line 3: t: it lasts 4000 s, and an estimate bridges at most 3600 s; "
-        "was a clock set? --window chooses a part of a file"
+        "was a clock set, or is it in ms or ns? --window chooses a part of a file"
     ]
     (tmp_path / "poses.csv").rename(tmp_path / "odometry.csv")
     assert refused(tmp_path).endswith("sigma_dheading; poses are in poses.csv")

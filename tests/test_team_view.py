@@ -242,12 +242,12 @@ def test_the_page_names_anchors_and_shows_unknown_ones_with_the_truth_only(
         page.wait_for_function(f"() => ({ANCHORS})().length === 3")
         assert page.evaluate(ANCHORS) == ["A1", "A2", "A4"]
         assert "A3" not in page.evaluate(LABELS)
-        page.keyboard.press("End")  # where it has been located, with its sigma, and the way that was driven
+        page.keyboard.press("End")  # where it is estimated, with its sigma, and the way that was driven
         page.wait_for_function(f"() => ({LABELS})().some((text) => /^A3 ± [0-9.]+ m?m$/.test(text))")
         shot(page, "team-located")
         legend = page.locator("#legend").inner_text()
-        assert "where a robot has located an anchor" in legend
-        assert "path, located" in legend
+        assert "anchor as a robot estimates it" in legend
+        assert "path, pose estimated" in legend
 
 
 # --- what is made of a run -----------------------------------------------------------------------------

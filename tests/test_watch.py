@@ -360,7 +360,7 @@ def test_a_sweep_shows_its_cells_and_its_figures(opened: Open, tmp_path: Path) -
         expect(page.locator("#title")).to_have_text("speeds")
         expect(page.locator("#sweep > .wide tbody tr")).to_have_count(2)
         expect(page.locator("#sweep > .wide tbody tr").first).to_contain_text("100.0 %")
-        expect(page.locator("#sweep")).to_contain_text("Individual trials are not recorded")
+        expect(page.locator("#sweep")).to_contain_text("Trials are not recorded")
         expect(page.locator("#sweep img").first).to_have_js_property("complete", value=True)
         expect(page.get_by_role("slider", name="Tick")).to_be_visible()  # the trials have been read
         shot(page, "sweep")

@@ -74,7 +74,7 @@ class Hypothesis(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """The hypotheses about all robots that are located."""
+    """The hypotheses about all located robots: those that have any. A localised robot claims its pose."""
 
     located: tuple[int, ...]
     """The indices of the robots to which the fits belong, ascending."""

@@ -110,11 +110,7 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
 
 
 def _ready(
-    options: argparse.Namespace,
-    config: RobotConfig,
-    old: Retrace | None,
-    memory: Memory | None,
-    inbox: Inbox,
+    options: argparse.Namespace, config: RobotConfig, old: Retrace | None, memory: Memory | None, inbox: Inbox
 ) -> Memory:
     """Return the state of a new or resumed robot, with its journal open. Raises CannotRecord."""
     journal: Journal | None = None

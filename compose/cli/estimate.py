@@ -59,6 +59,8 @@ def main(options: argparse.Namespace) -> int:
         problem = measurements(
             *(recording, options.robots, options.noise, options.window), relative=options.relative
         )
+        if problem.doubt:
+            raise UserError(f"{problem.source}: {problem.doubt}")
         if options.out is not None:
             make_folder(options.out)
         with counting("tandem estimate", len(problem.ends)) as done:

@@ -81,10 +81,7 @@ def _in_process(options: argparse.Namespace, scenario: Scenario, kills: tuple[Ki
 
 
 def _as_processes(
-    options: argparse.Namespace,
-    scenario: Scenario,
-    kills: tuple[Kill, ...],
-    clocks: Mapping[str, ClockError],
+    options: argparse.Namespace, scenario: Scenario, kills: tuple[Kill, ...], clocks: Mapping[str, ClockError]
 ) -> int:
     check_rate(scenario, options.rate)
     inbox = Inbox("tandem run")

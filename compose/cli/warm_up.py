@@ -16,14 +16,7 @@ from world.scenario import Scenario
 WARM_UP_MISSION = "paper-1"
 FORKED = ("world", "agent")
 """The commands that forked processes run."""
-RECEIVED = (
-    RobotConfig,
-    Scenario,
-    Observation | MissionEnd,
-    Report,
-    Command,
-    Command | FinalReport,
-)
+RECEIVED = (RobotConfig, Scenario, Observation | MissionEnd, Report, Command, Command | FinalReport)
 """The types that worlds and agents decode."""
 
 

@@ -142,7 +142,8 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
             claim, label = max(doubtful, default=-1) + 1, f"{one.id}, never claimed"
         rows = one.rows[claim:]
         places = [(row.x, row.y) for row in rows]
-        axes.plot(*zip(*places, strict=True), color=one.colour, lw=1.0, label=label)
+        axes.plot(*zip(*places, strict=True), color=one.colour, lw=1.0)
+        entry(axes, label, **{**one.marks, "color": one.colour, "lw": 1.0, "ms": 5})
         points += places
         for row in rows[:: math.ceil(len(rows) / OUTLINES_PER_PATH)]:
             if math.sqrt(row.xx + row.yy) <= TOO_WIDE:
@@ -166,7 +167,8 @@ def _path(drawn: Drawn, medium: Medium) -> Figure:
 def _over_time(drawn: Drawn, medium: Medium) -> Figure:
     """Return the figure of errors, NEES, hypotheses and residuals over time; the first two need the truth."""
     known = any(row.nees is not None for row in drawn.estimates.rows)
-    panels = {"position [m]": _positions, **({"NEES": _nees} if known else {}), "probability": _hypotheses}
+    position = "position\nerror [m]" if known else "position [m]"
+    panels = {position: _positions, **({"NEES": _nees} if known else {}), "probability": _hypotheses}
     rows = [[name] for label in panels for name in (label, f"{label} key")]
     sheet = Sheet(medium, False, drawn.title, [*rows, *[[pair] for pair in drawn.ranged]])
     for label, draw in panels.items():
@@ -175,6 +177,8 @@ def _over_time(drawn: Drawn, medium: Medium) -> Figure:
         for one in drawn.robots if label != "probability" else ():
             if one.claim is not None:
                 axes.axvline(one.times[one.claim], color=one.colour, lw=0.8, ls=":", zorder=0)
+        if label == position and any(one.claim is not None for one in drawn.robots):
+            entry(axes, "first claim", ls=":", lw=0.8, color=PALE)
         sheet.key(axes, f"{label} key")
     for which, pair in enumerate(drawn.ranged):
         _residuals(sheet.tall(pair, TALL), drawn, which)
@@ -183,8 +187,9 @@ def _over_time(drawn: Drawn, medium: Medium) -> Figure:
         axes = sheet.panels[label]
         axes.set_xlim(0.0, end)
         axes.grid(color="0.9", lw=0.5)
-        axes.set_ylabel(label if label in panels else f"{label} [m]")
+        axes.set_ylabel(label if label in panels else f"residual\n{label} [m]")
     axes.set_xlabel("time [s]")
+    sheet.figure.align_ylabels()
     return sheet.finished()
 
 
@@ -202,7 +207,7 @@ def _positions(axes: Axes, drawn: Drawn) -> None:
 def _nees(axes: Axes, drawn: Drawn) -> None:
     for one in drawn.robots:
         axes.plot(one.times, one.values("nees"), color=one.colour, lw=1.2, label=f"{one.id}, NEES")
-    axes.axhline(NEES_BOUND, color=PALE, lw=0.8, ls="--", label="99 % of right covariances are below")
+    axes.axhline(NEES_BOUND, color=PALE, lw=0.8, ls="--", label="99 % limit")
     axes.set_yscale("log")
 
 

@@ -11,16 +11,7 @@ from matplotlib.patches import Arc
 
 from agent.planning.drive import inside_arc
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import (
-    LABEL,
-    NO_PLACES,
-    Absent,
-    Sheet,
-    around,
-    circle,
-    heading,
-    trace,
-)
+from compose.figures.sheet import LABEL, NO_PLACES, Absent, Sheet, around, circle, heading, trace
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import RANGE_ARROW, TALLEST_PLANE, anchor, draw_trail, window
 from compose.view.colours import COLOURS

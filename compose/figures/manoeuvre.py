@@ -14,9 +14,10 @@ from matplotlib.figure import Figure
 from agent.planning.phase3_last_manoeuvre import Array, Compared, Plan, compared
 from agent.planning.tasks import LastManoeuvre
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import ANCHORS, LABEL, NO_ENCOUNTER, Absent, Sheet, circle, entry, heading, trace
+from compose.figures.sheet import ANCHORS, NO_ENCOUNTER, Absent, Sheet, circle, entry, heading, trace
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
+from compose.view.events import with_minus
 from protocol.mission import ROLES, Mission, Role
 from protocol.motion import ORIGIN, Pose, compose, inverse, rotated, step, travelled
 
@@ -87,7 +88,7 @@ def _figure(pair: PairRecord, one: Planned, medium: Medium) -> Figure:
     axes, value = sheet.panels["plane"], sheet.panels["value"]
     away = [travelled(seen.mover, other) for other in seen.others]
     half = WINDOW_MARGIN * max(mission.max_speed * mission.period, *away)
-    _hypotheses(axes, pair, one, seen, half)
+    _hypotheses(sheet, pair, one, seen, half)
     _reach(axes, pair, plan, seen, ways)
     x, y = seen.mover.x, seen.mover.y
     sheet.plane("plane", (x - half, x + half, y - half, y + half))
@@ -103,16 +104,18 @@ def _title(pair: PairRecord, one: Planned) -> str:
     plan, mover = one.plan, one.plan.question.mover
     robot, own = pair.robot(mover).id, plan.question.a == ORIGIN == plan.question.b
     frame = f"{robot}'s own frame" if own else rf"$\langle\,{mover}({ANCHORS[mover]})\rangle$"
-    chosen = rf"$v_2$ = {plan.command.v:g} m/s, $\omega_2$ = {plan.command.omega:+.4f} rad/s"
+    speed, turn = with_minus(f"{plan.command.v:g}"), with_minus(f"{plan.command.omega:+.4f}")
+    chosen = rf"$v_2$ = {speed} m/s, $\omega_2$ = {turn} rad/s"
     count = len(plan.question.placements)
     hypotheses = f"{count} hypotheses" if count > 1 else "1 hypothesis, to be checked"
     value = f", $J$ = {plan.separation_m2:.5g} m$^2$" if plan.separation_m2 is not None else ""
     return f"Plan of {robot} at $k$ = {one.tick}, in {frame}: {hypotheses}; {chosen}{value}"
 
 
-def _hypotheses(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
+def _hypotheses(sheet: Sheet, pair: PairRecord, one: Planned, seen: ManoeuvreView, half: float) -> None:
     """Draw where each hypothesis has the other robot, the last range, and the bisectors of all pairs."""
-    other, x, y = OTHER[one.plan.question.mover], seen.mover.x, seen.mover.y
+    axes, other = sheet.panels["plane"], OTHER[one.plan.question.mover]
+    x, y = seen.mover.x, seen.mover.y
     for (i, p), (j, q) in combinations(enumerate(seen.others, start=1), 2):
         apart = travelled(p, q)
         if apart > 0.0:
@@ -129,15 +132,12 @@ def _hypotheses(axes: Axes, pair: PairRecord, one: Planned, seen: ManoeuvreView,
         label = f"last range, {rho:.4f} m"
         circle(axes, (x, y), rho, ls=(0, (5, 3)), lw=1.0, color="k", gid="rho", label=label)
     end = step(seen.mover, one.plan.command.v, one.plan.command.omega, pair.mission.period)
-    text: Any = {"textcoords": "offset points", "ha": "center", "va": "center", "zorder": 6, "bbox": LABEL}
     for i, place in enumerate(seen.others, start=1):
-        away = travelled(seen.mover, place) or 1.0
         trace(
             axes, [place], ROLE_MARKERS[other]["marker"], ms=7, mfc=COLOURS[other], mec="white", mew=0.6,
             gid=f"hypothesis-{i}", zorder=5, label=f"{i}: predicted range {travelled(end, place):.4f} m",
         )  # fmt: skip
-        beside = -13 * (place.x - x) / away, -13 * (place.y - y) / away
-        axes.annotate(str(i), (place.x, place.y), xytext=beside, **text)
+        sheet.label(str(i), (place.x, place.y))
     entry(axes, _after(pair, one), ls="")
 
 
@@ -160,7 +160,7 @@ def _reach(axes: Axes, pair: PairRecord, plan: Plan, seen: ManoeuvreView, ways: 
             axes.plot(*seen.turned(x, y), "-", lw=0.7, color=PALER, zorder=1.5, gid=gid, label=label)
             label = None
     v, ends = float(ways.reach.v[chosen, 0]), seen.turned(ways.reach.x[chosen], ways.reach.y[chosen])
-    label = f"reachable with $v_2$ = {v:g} m/s"
+    label = f"reachable with $v_2$ = {with_minus(f'{v:g}')} m/s"
     axes.plot(*ends, "-", lw=2.0, color="k", zorder=2, gid="reach", label=label)
     times = [period * i / ARC_SEGMENTS for i in range(ARC_SEGMENTS + 1)]
     poses = [step(seen.mover, plan.command.v, plan.command.omega, time) for time in times]

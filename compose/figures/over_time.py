@@ -196,10 +196,7 @@ def _errors(axes: Axes, pair: PairRecord, role: Role, name: str) -> Points:
     sigmas = [
         (one.tick, getattr(one.covariance, f"{name}_sigma")) for one, _ in robot.likeliest if one.covariance
     ]
-    bounds, label = (
-        [(tick, BAND_SIGMAS * sigma) for tick, sigma in sigmas],
-        rf"{robot.id}, claimed 3 $\sigma$",
-    )
+    bounds, label = [(tick, BAND_SIGMAS * sigma) for tick, sigma in sigmas], f"{robot.id}, claimed 3 sigma"
     _line(axes, bounds, lw=0.9, ls=CLAIMED[role], gid=f"{name}-sigma-{robot.id}", label=label, **look)
     if (claim := robot.claim) is not None:
         axes.plot(
@@ -224,7 +221,7 @@ def draw_hypotheses(axes: Axes, pair: PairRecord, role: Role) -> None:
     weighed = any(one.probabilities for one, _ in robot.estimates)
     (_probabilities if weighed else _count)(axes, pair, role)
     words: dict[str, Any] = {"transform": axes.transAxes, "color": "0.3"}
-    axes.text(0.0, 1.04, "branches in the anchor's frame", **words)
+    axes.text(0.0, 1.04, "hypotheses in the anchor's frame", **words)
     if robot.placed:
         first = robot.placed[0][0].tick
         axes.axvline(first, color="0.3", lw=0.8, ls=":", gid="placed")

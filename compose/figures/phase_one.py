@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from agent.estimation.exact import Branch
 from agent.planning.state import RobotState
 from compose.figures.pair import PairRecord
-from compose.figures.sheet import ANCHORS, LABEL, Absent, Sheet, around, circle, entry, trace
+from compose.figures.sheet import ANCHORS, Absent, Sheet, around, circle, entry, trace
 from compose.figures.style import INK, PALE, PALER, ROLE_MARKERS, SCREEN, Medium
 from compose.view.colours import COLOURS
 from protocol.mission import Role
@@ -75,7 +75,7 @@ def draw(pair: PairRecord, role: Role, medium: Medium = SCREEN) -> Figure | Abse
             label = f"ruled out by $k$ = {', '.join(map(str, against))}"
             look: dict[str, Any] = {"ms": 8, "mew": 1.2, "color": INK, "zorder": 5, "gid": "contradicted"}
             trace(axes, [one.places[k] for k in against], "x", label=label, **look)
-    _name_points(axes, first.places, ranged)
+    _name_points(sheet, first.places, ranged)
     largest = max(reach, virtual or 0.0)
     points = [(-largest, -largest), (largest, largest)]
     points += [(place.x, place.y) for one in branches for place in one.places]
@@ -163,14 +163,11 @@ def contradicted(branch: Branch, track: Track, reach: float) -> list[int]:
     return found
 
 
-def _name_points(axes: Axes, places: list[Pose], ranged: list[tuple[int, float]]) -> None:
+def _name_points(sheet: Sheet, places: list[Pose], ranged: list[tuple[int, float]]) -> None:
     """Label p_0, p_1 and p_2, the positions of the first three ranges."""
     near = SHARED_LABEL * max(rho for _, rho in ranged)
     named = [places[tick] for tick, _ in ranged[:3]]
-    text: Any = {"textcoords": "offset points", "ha": "center", "va": "center", "zorder": 6, "bbox": LABEL}
     for i, place in enumerate(named):
         if any(travelled(place, other) < near for other in named[:i]):
             continue  # the robot has returned to a labelled position
-        away = math.hypot(place.x, place.y) or 1.0
-        beside = 11 * place.x / away, 11 * place.y / away
-        axes.annotate(f"$p_{i}$", (place.x, place.y), xytext=beside, gid=f"p-{i}", **text)
+        sheet.label(f"$p_{i}$", (place.x, place.y), gid=f"p-{i}")

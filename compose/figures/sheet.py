@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+import re
 from collections.abc import Callable, Iterable, Sequence
+from itertools import product
 from textwrap import wrap
 from typing import Any, NamedTuple, TypeVar
 
@@ -13,7 +15,8 @@ from matplotlib.colors import rgb_to_hsv, to_rgb
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Patch
+from matplotlib.text import Annotation
 from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox, blended_transform_factory
 from matplotlib.typing import ColorType
@@ -26,6 +29,8 @@ PAD = 0.04
 """The distance in inches between panels, and of all from the edges of a figure."""
 TITLE = 110
 """The maximum number of characters of a line of a title, which fit in the width PAGE."""
+UNPRINTED = re.compile(r"\\[a-z,]+|[$_{}]")
+"""What is not printed of symbols in a title, or as another character."""
 PANELS, ACROSS = 6, 3
 """The maximum number of panels of a series, in total and in a row."""
 LONE = 3.0
@@ -41,6 +46,8 @@ ANCHORS: dict[Role, str] = {"a": "M_1", "b": "M_2"}
 """The anchors' names in the paper, for use between two `$`."""
 LABEL = {"facecolor": "white", "alpha": 0.75, "pad": 0.6, "lw": 0}
 """The background of a text within a panel."""
+GAPS, DIRECTIONS = (4.0, 9.0, 14.0), 16
+"""The distances in points from a point to its label, and the number of directions, that are compared."""
 LINES = {"-": "solid", "--": "dashed", "-.": "dash-dotted", ":": "dotted"}
 MARKERS = {
     "o": "circles",
@@ -98,7 +105,11 @@ class Sheet:
         height = max(6.0, 0.5 * len(mosaic))  # labels alone must fit: without room, there is no layout
         self.figure = Figure(figsize=(self.width, height), layout=self._engine)
         if medium.titled:
-            lines = [part for line in (plain(title[0]), *title[1:]) for part in wrap(line, TITLE)]
+            lines = [
+                part
+                for line in (plain(title[0]), *title[1:])
+                for part in wrap(line, TITLE + len("".join(UNPRINTED.findall(line))))
+            ]
             self.figure.suptitle("\n".join(lines), x=PAD / self.width, ha="left", size=TEXT, color=INK)
         self.panels: dict[str, Axes] = self.figure.subplot_mosaic(
             [list(row) for row in mosaic], width_ratios=widths, empty_sentinel=""
@@ -107,6 +118,7 @@ class Sheet:
         self._widths = list(widths or [1.0] * len(mosaic[0]))
         self._heights: dict[str, Callable[[], float]] = {}
         self._planes: list[Axes] = []
+        self._labels: list[tuple[Annotation, float]] = []
 
     def tall(self, name: str, height: float) -> Axes:
         """Return the panel `name`, which is `height` inches high."""
@@ -127,6 +139,40 @@ class Sheet:
         ratio = (top - bottom) / (right - left)
         self._planes.append(axes)
         self._heights[name] = lambda: min(tallest, ratio * self.width * _place(axes).width)
+
+    def label(self, text: str, at: tuple[float, float], radius: float = 0.0, **look: Any) -> None:
+        """Write `text` beside a point of the panel "plane", outside of `radius` m."""
+        look = {"ha": "center", "va": "center", "zorder": 7, "bbox": LABEL, **look}
+        drawn = self.panels["plane"].annotate(text, at, xytext=(0, 0), textcoords="offset points", **look)
+        self._labels.append((drawn, radius))
+
+    def _place_labels(self) -> None:
+        """Move each label, in order, to where the fewest lines and labels are in its way."""
+        axes, points = self.panels["plane"], self.figure.dpi / 72.0
+        axes.apply_aspect()
+        artists: list[Line2D | Patch] = [*axes.lines, *axes.patches]
+        drawn = [one.get_transform().transform_path(one.get_path()) for one in artists]
+        extents = [path.get_extents() for path in drawn]
+        frame, placed = axes.bbox.padded(-points), list[Bbox]()
+        for text, radius in self._labels:
+            extent, least = text.get_window_extent(), math.inf
+            away = math.dist(*axes.transData.transform([text.xy, (text.xy[0] + radius, text.xy[1])]))
+            area = extent.padded(away + GAPS[-1] * points + extent.width)
+            paths = [path for path, box in zip(drawn, extents, strict=True) if area.overlaps(box)]
+            for gap, turn in product(GAPS, range(DIRECTIONS)):
+                angle = 0.5 * math.pi + 2.0 * math.pi * turn / DIRECTIONS
+                right = (away + gap * points + 0.5 * extent.width) * math.cos(angle)
+                up = (away + gap * points + 0.5 * extent.height) * math.sin(angle)
+                box = extent.translated(right, up)
+                blocked = box.count_overlaps(placed) + (frame.count_contains(box.corners()) < 4)
+                crossed = sum([path.intersects_bbox(box.padded(points), filled=False) for path in paths])
+                crossed += len(drawn) * blocked
+                if crossed < least:
+                    least, best = crossed, box
+                    text.set_position((right / points, up / points))
+                if not crossed:
+                    break
+            placed.append(best)
 
     def key(self, panel: Axes, name: str = "key", **look: Any) -> None:
         """Draw the legend of `panel` in the cell `name`, with as many columns as fit.
@@ -175,6 +221,8 @@ class Sheet:
             axes.set_aspect("equal", adjustable="box", anchor="NW")
         self._engine.execute(self.figure)
         self.figure.set_layout_engine("none")
+        if self._labels:
+            self._place_labels()
         self.figure.set_label("\n".join(self._caption))
         return self.figure
 

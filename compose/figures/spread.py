@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import FancyArrowPatch
 from matplotlib.ticker import MaxNLocator
 
-from compose.figures.sheet import LABEL, NO_TRUTH, Absent, Sheet, around, circle, entry, trace
+from compose.figures.sheet import NO_TRUTH, Absent, Sheet, around, circle, entry, trace
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import TALLEST_PLANE
 from compose.recording.run import Run
@@ -45,7 +45,7 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
     axes, reach = sheet.panels["plane"], setup.mission.sensing_range
     for one in robots:
         label = f", $k$ = {claims[one.id]}" if one.id in claims and len(robots) <= MOST_AXIS_TICKS else ""
-        _robot(axes, one, run.truth(one.id), claims.get(one.id), reach, one.id + label)
+        _robot(sheet, one, run.truth(one.id), claims.get(one.id), reach, one.id + label)
     _tree(axes, setup, claims)
     entry(axes, "anchor", "x", color="k", ms=4, mew=1.2)
     if len(setup.anchored) < len(robots):
@@ -65,22 +65,21 @@ def draw(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
 
 
 def _robot(
-    axes: Axes, one: RobotSetup, path: Sequence[Pose], claimed: int | None, reach: float, label: str
+    sheet: Sheet, one: RobotSetup, path: Sequence[Pose], claimed: int | None, reach: float, label: str
 ) -> None:
     """Draw the anchor of a robot, its sensing range, and its path in two colours, before and after its claim.
 
     A robot without an anchor has a triangle where it starts.
     """
+    axes, radius = sheet.panels["plane"], reach if one.given_anchor is not None else 0.0
     hue, at = COLOURS[LANE_COLOURS[claimed is not None]], one.given_anchor or path[0]
     x, y = at.x, at.y
     if one.given_anchor is not None:
         axes.plot(x, y, "x", color="k", ms=4, mew=1.2, zorder=4, gid=f"anchor-{one.id}")
         circle(axes, (x, y), reach, ls="-", lw=0.8, color=hue, gid=f"range-{one.id}")
-        y += reach
     else:
         axes.plot(x, y, "^", color=hue, ms=5, zorder=4, gid=f"start-{one.id}")
-    place: Any = {"xytext": (0, 2), "textcoords": "offset points", "ha": "center", "zorder": 7, "bbox": LABEL}
-    axes.annotate(label, (x, y), gid=f"localised-{one.id}", **place)
+    sheet.label(label, (x, y), radius, gid=f"localised-{one.id}")
     since = claimed if claimed is not None else len(path)
     for known, poses in ((False, path[: since + 1]), (True, path[since:])):
         if len(poses) > 1:

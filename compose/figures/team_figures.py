@@ -11,7 +11,7 @@ from matplotlib.patches import Polygon
 from matplotlib.ticker import MaxNLocator
 
 from compose.figures.over_time import BAND_SIGMAS, FLOOR, QUANTITIES, TALL
-from compose.figures.sheet import LABEL, NO_TRUTH, Absent, Sheet, around, circle, entry, heading, trace
+from compose.figures.sheet import NO_TRUTH, Absent, Sheet, around, circle, entry, heading, trace
 from compose.figures.style import INK, PALE, SCREEN, Medium
 from compose.figures.trajectory import TALLEST_PLANE
 from compose.recording.run import Run
@@ -36,7 +36,7 @@ def trajectory(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
         return Absent(NO_TRUTH)
     sheet = Sheet(medium, True, [run.title(run.robots)])
     axes, reach = sheet.panels["plane"], setup.mission.sensing_range
-    points = _anchors(axes, setup)
+    points = _anchors(sheet, setup)
     entry(axes, "start", "s", ms=5, mfc="white", mec=INK, mew=1.1)
     for robot, hue in _hues(run).items():
         path, claim = run.truth(robot), run.claim(robot)
@@ -46,8 +46,7 @@ def trajectory(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
         )
         trace(axes, path[:1], "s", ms=5, mfc="white", mec=hue, mew=1.1, zorder=4, gid=f"released-{robot}")
         heading(axes, path[0], ARROW * reach, hue)
-        at = (path[0].x, path[0].y)
-        axes.annotate(robot, at, xytext=(-9, -9), textcoords="offset points", color=hue, zorder=7, bbox=LABEL)
+        sheet.label(robot, (path[0].x, path[0].y), color=hue)
         if claim is not None:
             spot = path[claim.tick : claim.tick + 1]
             trace(axes, spot, "*", ms=9, mfc=hue, mec="white", mew=0.6, zorder=6, gid=f"claim-{robot}")
@@ -61,9 +60,10 @@ def trajectory(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
     return sheet.finished()
 
 
-def _anchors(axes: Axes, setup: RunSetup) -> list[tuple[float, float]]:
+def _anchors(sheet: Sheet, setup: RunSetup) -> list[tuple[float, float]]:
     """Draw the anchors where they are, hollow if the robots do not know that, and return their places."""
-    reach, looks = setup.mission.sensing_range, {True: "anchor", False: "anchor at an unknown position"}
+    axes, reach = sheet.panels["plane"], setup.mission.sensing_range
+    looks = {True: "anchor", False: "anchor at an unknown position"}
     for known, label in looks.items():
         if any((one.position is not None) == known for one in setup.anchors):
             entry(axes, label, "^", ms=6, mfc="k" if known else "white", mec="k")
@@ -74,7 +74,7 @@ def _anchors(axes: Axes, setup: RunSetup) -> list[tuple[float, float]]:
         place, colour = (at.x, at.y), "k" if one.position is not None else "white"
         points.append(place)
         axes.plot(*place, "^", ms=6, mfc=colour, mec="k", zorder=4, gid=f"anchor-{one.id}")
-        axes.annotate(one.id, place, xytext=(5, 5), textcoords="offset points", zorder=6, bbox=LABEL)
+        sheet.label(one.id, place)
         name = f"sensing range, {reach:g} m" if i == 0 else None
         circle(axes, place, reach, ls=(0, (4, 3)), lw=0.7, color=PALE, gid=f"range-{one.id}", label=name)
     return points
@@ -99,7 +99,7 @@ def errors(run: Run, medium: Medium = SCREEN) -> Figure | Absent:
         axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel(f"tick ({mission.period:g} s)")
     axes = sheet.panels["position"]
-    entry(axes, r"3 $\sigma$", ls=SIGMAS, lw=0.9, color=PALE)
+    entry(axes, "3 sigma", ls=SIGMAS, lw=0.9, color=PALE)
     entry(axes, "claim", "o", **CIRCLE)
     sheet.key(axes)
     return sheet.finished()

@@ -232,11 +232,7 @@ class ForkServer:
         self._listener.start()
 
     def start(
-        self,
-        main: str,
-        title: str,
-        *arguments: str,
-        on_end: Callable[[], None] = lambda: None,
+        self, main: str, title: str, *arguments: str, on_end: Callable[[], None] = lambda: None
     ) -> ChildProcess:
         """Fork a process that calls `main`, a module:function, with `arguments` in sys.argv.
 

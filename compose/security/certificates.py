@@ -162,11 +162,7 @@ def _participant(own: Path, name: str, authority: Authority, hosts: Sequence[str
 
 
 def issue(
-    authority: Authority,
-    name: str,
-    public: ec.EllipticCurvePublicKey,
-    hosts: Sequence[str],
-    lasts: timedelta,
+    authority: Authority, name: str, public: ec.EllipticCurvePublicKey, hosts: Sequence[str], lasts: timedelta
 ) -> x509.Certificate:
     """Return a certificate of `name` for connecting and for listening at `hosts`, valid for `lasts`."""
     now = datetime.now(UTC)

@@ -155,17 +155,10 @@ def figure(rows: Sequence[Row]) -> Figure:
             colour, _, marker = STYLES[number % len(STYLES)]
             some = [row for row in rows if row["scenario"] == scenario]
             values = np.array([[row[name + end] for end in ENDS] for row in some], float).T
-            axes.errorbar(
-                values[0],
-                [planners.index(row["planner"]) + 0.15 * number for row in some],
-                xerr=np.maximum(0.0, [values[0] - values[1], values[2] - values[0]]),
-                color=colour,
-                marker=marker,
-                ls="",
-                ms=4,
-                capsize=2.5,
-                label=scenario,
-            )
+            places = [planners.index(row["planner"]) + 0.15 * number for row in some]
+            bars = np.maximum(0.0, [values[0] - values[1], values[2] - values[0]])
+            look: Any = {"color": colour, "marker": marker, "ls": "", "ms": 4, "label": scenario}
+            axes.errorbar(values[0], places, xerr=bars, capsize=2.5, **look)
         axes.set_xlabel(f"{label} (95 % interval)")
         axes.grid(axis="x", lw=0.4, color="0.85")
         axes.set_yticks(range(len(planners)), planners)

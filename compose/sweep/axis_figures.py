@@ -7,7 +7,7 @@ import re
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -126,27 +126,21 @@ def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[F
     joined = _numbers(axis) is not None
     lines = list(dict.fromkeys(point.line for point in points))
     quantities = list(dict.fromkeys(point.quantity for point in points))
+    bounded = any(not math.isnan(point.low) for point in points)
     for (i, line), (rank, quantity) in product(enumerate(lines), enumerate(quantities)):
         colour, style, marker = STYLES[i]
         shown = [point for point in points if (point.line, point.quantity) == (line, quantity)]
         aside = 0.0 if joined else POINTS_SPREAD / len(lines) * (i - 0.5 * (len(lines) - 1))
         values = np.array([point[3:] for point in shown]).T.reshape(3, -1)
-        axes.errorbar(
-            [at[point.value] + aside for point in shown],
-            values[0],
-            yerr=np.maximum(0.0, [values[0] - values[1], values[2] - values[0]]),
-            color=colour,
-            ls=style if joined else "",
-            marker=marker,
-            ms=4,
-            mfc="white" if rank else colour,
-            lw=0.7 if rank else 1.2,
-            capsize=2.5,
-            label=line if not rank else None,
-        )
+        look: dict[str, Any] = {"color": colour, "marker": marker, "ms": 4, "ls": style if joined else ""}
+        look |= {"mfc": "white", "lw": 0.7} if rank else {"mfc": colour, "lw": 1.2, "label": line}
+        if bounded:
+            bars = np.maximum(0.0, [values[0] - values[1], values[2] - values[0]])
+            look |= {"yerr": bars, "capsize": 2.5}
+        axes.errorbar([at[point.value] + aside for point in shown], values[0], **look)
     for rank, quantity in enumerate(filter(None, quantities)):
-        axes.plot([], [], "o", color="0.3", ms=4, mfc="white" if rank else "0.3", label=quantity)
-    bounded = any(not math.isnan(point.low) for point in points)
+        face, name = "white" if rank else "0.3", quantity.replace("%", "% quantile")
+        axes.plot([], [], "o", color="0.3", ms=4, mfc=face, label=name)
     axes.set_ylabel(f"{statistic.label} (95 % interval)" if bounded else statistic.label)
     if not points:
         axes.annotate("no such trial", (0.5, 0.5), xycoords="axes fraction", ha="center")
@@ -160,14 +154,9 @@ def over_axis(sweep: Sweep, place: int, statistic: Statistic, points: Sequence[F
         others = [one for one in sweep.axes if one is not axis and len(one.values) > 1]
         unpaired = ", ".join([one.name for one in others if not one.paired])
         columns = next((n for n in (4, 2) if n * (BESIDE_LABEL + max(map(len, labels))) <= WIDEST_LEGEND), 1)
-        figure.legend(
-            handles,
-            labels,
-            title=f"other draws at each value of {unpaired}" if unpaired else None,
-            loc="outside upper center",
-            ncols=min(columns, len(labels)),
-            frameon=False,
-        )
+        title = f"other random draws at each value of {unpaired}" if unpaired else None
+        look = {"loc": "outside upper center", "ncols": min(columns, len(labels)), "frameon": False}
+        figure.legend(handles, labels, title=title, **look)
     return figure
 
 
@@ -198,7 +187,7 @@ def _against(axis: Axis) -> tuple[Figure, Axes, list[float]]:
     figure = Figure(figsize=(7.2, 5.0 if crowded else 3.6), layout="constrained")
     axes = figure.subplots()
     name = axis.name.replace("-", " ")
-    axes.set_xlabel(name if axis.paired else f"{name} (other draws at each value)")
+    axes.set_xlabel(name if axis.paired else f"{name} (other random draws at each value)")
     axes.grid(axis="y", lw=0.4, color="0.85")
     if numbers is not None:
         if min(numbers) > 0.0 and max(numbers) >= LOGARITHMIC * min(numbers):

@@ -122,11 +122,7 @@ async def _threads(address: str) -> int:
 
 
 def play(
-    client: Client,
-    threads: int,
-    work: Sequence[Chunk],
-    inbox: Inbox,
-    done: Callable[[list[TrialRow]], None],
+    client: Client, threads: int, work: Sequence[Chunk], inbox: Inbox, done: Callable[[list[TrialRow]], None]
 ) -> None:
     """Run all trials of `work`, and call `done` with the rows of each chunk of them as it completes.
 

@@ -152,8 +152,8 @@ def _difference_lines(results: Results) -> list[str]:
     unpaired = [axis.name for axis in results.sweep.axes if not axis.paired and len(axis.values) > 1]
     if unpaired:
         found += text_width.wrapped(
-            f"not paired: trials have other draws at each value of {', '.join(unpaired)}, so cells also "
-            "differ by chance"
+            f"not paired: trials have other random draws at each value of {', '.join(unpaired)}, so cells "
+            "also differ by chance"
         )
     return found
 

@@ -180,8 +180,8 @@ def _verdict(robot_setup: RobotSetup, command: Command, now: TickData) -> Event:
     robot = robot_setup.id
     match command.verdict:
         case Localised(pose):
-            place, truth = f"({pose.x:.2f}, {pose.y:.2f}) m", now.truth.get(robot)
-            text = f"{robot} claims to be at {place}, heading {wrap(pose.heading):+.2f} rad"
+            place = with_minus(f"({pose.x:z.2f}, {pose.y:z.2f}) m, heading {wrap(pose.heading):+z.2f} rad")
+            text, truth = f"{robot} claims to be at {place}", now.truth.get(robot)
             error = f"the error is {metres(travelled(pose, truth))}" if truth is not None else None
             return Event(now.tick, "claim", robot, text, error)
         case verdict:
@@ -213,4 +213,9 @@ def _believing(robot_setup: RobotSetup, before: TickData | None, now: TickData) 
 
 def metres(length: float) -> str:
     """Return `length`, in m, as text with its unit."""
-    return f"{length:.2f} m" if 0.095 <= length < 1e5 else f"{length:.2g} m"
+    return with_minus(f"{length:.2f} m" if 0.095 <= length < 1e5 else f"{length:.2g} m")
+
+
+def with_minus(numbers: str) -> str:
+    """Return `numbers` with minus signs in place of hyphens."""
+    return numbers.replace("-", "\N{MINUS SIGN}")

@@ -200,10 +200,10 @@ def undetermined(robot: int, located: tuple[int, ...], measured: JointMeasuremen
         return f"{with_others} {ranged}; two at different places are needed"
     rows = beacons(robot, located, measured)
     if len(rows) < FEWEST_DECISIVE:
-        beacon = "located robots" if measured.started else "anchors and located robots"
+        beacon = "robots with a pose" if measured.started else "anchors and robots with a pose"
         return f"{len(rows)} of {FEWEST_DECISIVE} required ranges to {beacon}"
     if len(set(ranges.radio[rows].tolist())) < 2 and bool(np.all(ranges.second[rows] < 0)):
-        return "its ranges are to one anchor, and to no robot that is located"
+        return "its ranges are to one anchor, and to no robot with a pose"
     return "too few of its ranges are from different places, or no pose explains them"
 
 

@@ -371,16 +371,18 @@ class NoAnchors(UserError):
 def _check_anchors(part: RangeRecording, recording: RangeRecording) -> None:
     """Raise NoAnchors for one robot, or for two, in `part`. Of more robots, some may be estimated.
 
-    It also raises NoAnchors if all ranges of these robots in `recording` are of other times than odometry.
+    It also raises NoAnchors if all ranges of these robots in `recording` are of other times than odometry, or
+    half of them where the others are to too few anchors.
     """
     whole = recording.part([one.id for one in part.robots], -math.inf, math.inf)
     t, (begin, end) = whole.ranges.t, whole.span
-    if t.size and not ((t >= begin) & (t <= end)).any():
-        when = f"{t[0]:.15g} s to {t[-1]:.15g} s, and odometry of {begin:.15g} s to {end:.15g} s"
-        raise NoAnchors(f"{part.source}: ranges are of {when}: stamps have to be in s, on one clock")
     count, placed = len(part.robots), part.with_places()
     anchors = [placed.anchors_of(robot) for robot in range(count)]
-    if count > 2 or len({(one.x, one.y) for own in anchors for one in own}) > 1:
+    enough = count > 2 or len({(one.x, one.y) for own in anchors for one in own}) > 1
+    if t.size and np.mean((t >= begin) & (t <= end)) <= (0.0 if enough else 0.5):
+        when = f"{t[0]:.15g} s to {t[-1]:.15g} s, and odometry of {begin:.15g} s to {end:.15g} s"
+        raise NoAnchors(f"{part.source}: ranges are of {when}: stamps have to be in s, on one clock")
+    if enough:
         return
     heard = [
         f"{robot.id} has ranges to {listed([one.id for one in own]) or 'no anchor'}"

@@ -44,9 +44,10 @@ TUM = re.compile(r"(?P<table>poses|truth)-(?P<robot>.+)\.tum")
 TUM_FIELDS = ("t", "x", "y", "z", "qx", "qy", "qz", "qw")
 """The fields of a line of a TUM file."""
 
+TABLES_NEEDED = "ranges.csv and odometry.csv or poses.csv"
 READABLE_FORMATS = (
-    "a .pyfg file, an .mcap file, a folder with ranges.csv and odometry.csv or poses.csv, a .toml file that "
-    "maps a rosbag2, or a recording of Tandem"
+    f"a .pyfg file, an .mcap file, a folder with {TABLES_NEEDED}, a .toml file that maps a rosbag2, or a "
+    "recording of Tandem"
 )
 """The formats that can be read."""
 BAG_METADATA = "metadata.yaml"
@@ -106,6 +107,8 @@ def read_ranges(path: Path, anchors_csv: Path | None = None) -> RangeRecording:
             add_mcap(builder, path)
         else:
             path.stat()
+            if path.suffix == ".csv":
+                raise BadRecording(f"{path}: name the folder that it is in, with {TABLES_NEEDED}")
             raise BadRecording(f"{path}: it is not {READABLE_FORMATS}")
     except OSError as error:
         raise BadRecording(f"{error.filename or path} cannot be read: {error.strerror or error}") from None

@@ -194,7 +194,7 @@ class RecordingBuilder:
             what = f"t0: it starts {late:.6g} s after the end of the increment of {row.robot} before it"
             begin, end = before, row.t0
         limit = f"an estimate bridges at most {LONGEST_GAP_S:g} s"
-        what += f", and {limit}; was a clock set? --window chooses a part of a file"
+        what += f", and {limit}; was a clock set, or is it in ms or ns? --window chooses a part of a file"
         self._jumps.setdefault(row.robot, []).append(Jump(begin, end, f"{place}: {what}"))
 
     def _add_range(self, row: RangeRow, place: object) -> None:
@@ -258,7 +258,7 @@ class RecordingBuilder:
                 long = f"increments of {one.id} last {lasts:.6g} s in the median"
                 limit = f"{LONG_GAP_S:g} s is the limit"
                 raise BadRecording(
-                    f"{self.source}: {long}, and {limit}: are times in ms? They have to be in s"
+                    f"{self.source}: {long}, and {limit}: are times in ms or ns? They have to be in s"
                 )
 
     def _robot(self, name: str) -> RecordedRobot:
@@ -293,7 +293,7 @@ class RecordingBuilder:
                 if name in robots or name in anchors or name in found or row.t >= before_s:
                     continue
                 advice = did_you_mean(name, [*robots, *anchors])
-                advice = advice or "; --anchors FILE adds some, without x and y if unknown, to a file"
+                advice = advice or "; --anchors FILE adds some, without x and y if unknown"
                 found[name] = (
                     f"{place}: {name} is neither a robot with odometry nor a known anchor; {there}{advice}"
                 )

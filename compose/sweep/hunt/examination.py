@@ -18,12 +18,7 @@ from compose.scenario.kills import Kill
 from compose.scenario.scenario_file import validate
 from compose.sweep.hunt.invariants import Breach, bounds, breaches, guaranteed
 from compose.sweep.hunt.mutation import Clues
-from compose.sweep.hunt.reached_states import (
-    DISTURBED,
-    TooLongError,
-    WatchedPlanner,
-    reached,
-)
+from compose.sweep.hunt.reached_states import DISTURBED, TooLongError, WatchedPlanner, reached
 from protocol.journal.journal_file import MemoryJournal, packed
 from protocol.network.clock import ClockError
 from protocol.wire import EncodedMessages

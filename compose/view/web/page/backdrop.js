@@ -3,6 +3,7 @@
 
 import { TAU } from "./geometry.js";
 import { draw_tree } from "./group.js";
+import { AROUND, GROUND_ALPHA } from "./labels.js";
 import { Layer } from "./layer.js";
 import { DASHED, line, stroked } from "./pen.js";
 import { rounded_up } from "./strip.js";
@@ -47,7 +48,7 @@ export class Backdrop {
       .filter(({ anchor }) => anchor);
   }
 
-  /** Draws the grid, and a bar with its unit. */
+  /** Draws the grid. */
   #grid(look) {
     const { plane } = this, { width, height, scale, centre, context: pen } = plane;
     const unit = rounded_up(Math.min(80, width / 9) / scale);
@@ -63,12 +64,21 @@ export class Backdrop {
       pen.moveTo(0, py); pen.lineTo(width, py);
     }
     stroked(pen, look.grid, 1);
-    const bar = unit * scale, x = width - 14, y = height - 14;
+    this.unit = unit;
+    this.bar = [width - 14 - Math.max(unit * scale, 60), height - 32, width - 14, height - 10];
+  }
+
+  /** Draws the length of a unit of the grid, over paths that run behind it. */
+  scale_bar(pen, look) {
+    const [left, top, x, bottom] = this.bar, bar = this.unit * this.plane.scale, y = bottom - 4;
+    pen.globalAlpha = GROUND_ALPHA;
+    pen.fillStyle = look.paper;
+    pen.fillRect(left - AROUND, top, x - left + 2 * AROUND, bottom - top);
+    pen.globalAlpha = 1;
     line(pen, [[x - bar, y - 4], [x - bar, y], [x, y], [x, y - 4]], look.faint, 2);
     pen.fillStyle = look.faint;
     pen.textAlign = "right";
-    pen.fillText(unit >= 1 ? `${unit} m` : metres(unit), x - 5, y - 5);
-    this.bar = [x - Math.max(bar, 60), y - 18, x, y + 4];
+    pen.fillText(this.unit >= 1 ? `${this.unit} m` : metres(this.unit), x - 5, y - 5);
   }
 
   /** Draws the range of an anchor, and its robot's orbit or, in a team, three sigmas of its position. */

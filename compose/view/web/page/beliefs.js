@@ -47,9 +47,7 @@ export class Beliefs {
       outlined(pen, robot.role, [x, y], pose[2], grown, colour, tints.length ? 2.6 : 2);
       const many = held.probability.length > 1 && chance > 0.01;
       const parts = [...(tints.length > 1 ? [String(tints[place] + 1)] : []), ...(many ? [probability(chance)] : [])];
-      if (parts.length && place < 6 && size > 6) {
-        labels.put(parts.join(": "), x - grown - 4, y + grown + 8, colour, "right", { around: grown + 4 });
-      }
+      if (parts.length && place < 6 && size > 6) labels.put(parts.join(": "), x - grown - 4, y + grown + 8, colour, "right", { around: grown + 4 });
       if (!truth && place === 0 && player.down) cross(pen, x, y, grown, look);
       if (!truth && place === 0) {
         const name = player.down ? `${robot.id} is down` : robot.id;
@@ -60,14 +58,14 @@ export class Beliefs {
     return undefined;
   }
 
-  /** Draws where a robot has located the anchors that are not surveyed, with three sigmas: one robot's, as all share their ranges. */
+  /** Draws where a robot estimates the anchors that are not surveyed, with three sigmas: one robot's, as all share their ranges. */
   anchors(view, robots) {
     const { store, scene, look, truth } = view, pen = this.plane.context, { labels, marks, scale } = this.plane;
     const held = robots.map(({ id }) => scene.players[store.places.get(id)]?.held).find((one) => one?.anchors);
     for (const [id, position, sigma] of held?.anchors ?? []) {
       const [x, y] = this.plane.at(position), radius = SIGMAS * sigma * scale;
       if (SIGMAS * sigma > store.stage.mission.sensing_range) continue; // it is hardly anywhere
-      marks.add("located");
+      marks.add("estimated");
       pen.beginPath();
       pen.arc(x, y, Math.max(radius, 3), 0, TAU);
       this.#cloud(look);

@@ -16,7 +16,7 @@ const COMMON = [
   ["loss", "reports lost", () => 1],
 ];
 /** The values of one robot: name and label. */
-const OWN = [["x", "start x"], ["y", "start y"], ["heading", "heading in rad"], ["anchor_x", "anchor x"], ["anchor_y", "anchor y"]];
+const OWN = [["x", "start x in m"], ["y", "start y in m"], ["heading", "heading in rad"], ["anchor_x", "anchor x in m"], ["anchor_y", "anchor y in m"]];
 
 export class Changes {
   /** `shown` is called with the name of a mission that has been run; `redraw` after each change. */

@@ -1,6 +1,7 @@
 // The page of an estimate: a table of its robots, the numbers of ranges, and its figures.
 
 import { make } from "./cards.js";
+import { number } from "./words.js";
 
 export async function estimate(root) {
   const answer = await fetch("/api/results/estimate"), result = await answer.json();
@@ -13,11 +14,10 @@ export async function estimate(root) {
   const { source, noise, frame, begin_s, robots, ranges, blocking_reason, figures } = result;
   const facts = [["noise", noise], ...(frame ? [["frame", `of ${frame}, first pose`]] : []), ...Object.entries(ranges).map(([pair, count]) => [`ranges ${pair}`, count])];
   root.replaceChildren(
-    make("dl", { className: "facts" }, ...facts.map(([what, value]) => make("div", {}, make("dt", { textContent: what }), make("dd", { textContent: value })))),
+    fact_list(facts),
     table(robots, begin_s),
     make("p", { className: "note", textContent: blocking_reason ? `At the end no claim is possible: ${blocking_reason}.` : "Times are from the first odometry on, poses in metres and radians." }),
-    make("div", { className: "figures" }, ...figures.map((figure) => make("figure", {},
-      make("img", { src: `/api/figures/${encodeURIComponent(figure)}`, alt: figure.replace(".svg", "").replaceAll("-", " "), loading: "lazy" })))),
+    figures_of(figures),
   );
   return source.split("/").at(-1);
 }
@@ -38,4 +38,11 @@ function table(robots, begin_s) {
   return make("div", { className: "wide", tabIndex: 0 }, make("table", {}, make("thead", {}, head), make("tbody", {}, ...body)));
 }
 
-const figure = (value, digits) => make("td", { className: "figure", textContent: Number.isFinite(value) ? value.toFixed(digits) : "–" });
+const figure = (value, digits) => make("td", { className: "figure", textContent: Number.isFinite(value) ? number(value, digits) : "–" });
+
+/** Returns [name, value] of results as a list. */
+export const fact_list = (facts) => make("dl", { className: "facts" }, ...facts.map(([what, value]) => make("div", {}, make("dt", { textContent: what }), make("dd", { textContent: value }))));
+
+/** Returns the figures of results, by the names of their files. */
+export const figures_of = (names) => make("div", { className: "figures" }, ...names.map((name) => make("figure", {},
+  make("img", { src: `/api/figures/${encodeURIComponent(name)}`, alt: name.replace(".svg", "").replaceAll("-", " "), loading: "lazy" }))));

@@ -3,7 +3,7 @@
 const GAP = 2;
 const LEAST_ALPHA = 0.9;
 /** The opacity of the ground of a label, under which lines are pale, and how far it reaches around the text. */
-const GROUND_ALPHA = 0.65, AROUND = 2;
+export const GROUND_ALPHA = 0.65, AROUND = 2;
 /** The distance of the points of a line of which labels keep clear, and half of its width, in pixels. */
 const EVERY = 6, HALF = 4;
 const MOST_PARTS = 60;

@@ -1,7 +1,7 @@
 // The legend beside the plane: only the marks that are drawn now, and those above the time line, in plain words.
 
 import { make } from "./cards.js";
-import { SIGNS } from "./words.js";
+import { SIGNS, STEPS } from "./words.js";
 
 /** The least width in pixels of a window in which the legend is open at first. */
 const WIDE_PX = 900;
@@ -22,12 +22,12 @@ const LASTING = {
   localised: [drawn(`<path ${POINTED} fill="var(--robot-a)"/>`), ({ team }) => `localised robot, its path${team ? "" : " and its anchor"}`],
   unlocalised: [drawn(`<path ${ROUND} fill="var(--robot-b)"/>`), "robot that is not yet localised, its path"],
   meeting: [drawn('<path d="M1 8h20" stroke="var(--robot-a)" stroke-width="1.3"/><path d="M28 8l-7 3v-6z" fill="var(--robot-a)"/>'), "who localises whom; dotted: planned"],
-  anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor (beacon)${range && `; range ${range}`}`],
+  anchor: [drawn('<circle cx="15" cy="8" r="7.5" fill="var(--disc)" stroke="var(--ring)"/><path d="M15 4.5l3.5 6h-7z" fill="var(--ink)"/>'), ({ range }) => `anchor${range && `; sensing range ${range}`}`],
   unsurveyed: [drawn('<path d="M15 4.5l3.5 6h-7z" fill="var(--paper)" stroke="var(--ink)"/>'), "anchor at a position that robots do not know"],
   orbit: [drawn('<path d="M2 15q13-22 26 0" fill="none" stroke="var(--orbit)" stroke-width="1.6" stroke-dasharray="6 4"/>'), ({ own }) => (own ? "orbit" : "search circle (phase 2)")],
-  "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), ({ own, team }) => (team ? "path, not located" : `path, phase 1${own ? "" : ": near anchor"}`)],
+  "path-1": [line("faint", 'stroke-dasharray="1.5 4"'), ({ own, team }) => (team ? "path, pose unknown" : `path, phase 1${own ? "" : ": near anchor"}`)],
   "path-2": [line("faint", 'stroke-dasharray="6 4"'), ({ own, team }) => (team ? "path to another anchor" : `path, phase 2${own ? "" : ": search"}`)],
-  "path-3": [line("faint"), ({ own, team }) => (team ? "path, located" : `path, phase 3${own ? "" : ": encounter"}`)],
+  "path-3": [line("faint"), ({ own, team }) => (team ? "path, pose estimated" : `path, phase 3${own ? "" : ": encounter"}`)],
   reported: [line("fault", 'stroke-dasharray="6 4"'), "path that an attacker reports"],
 };
 /** The other marks. */
@@ -43,7 +43,7 @@ const MOMENTARY = {
   "ruled-out": [drawn(`<path ${POINTED} fill="none" stroke="var(--ghost)" stroke-dasharray="3 2.2"/><path d="${cross}" stroke="var(--fault)" stroke-width="1.8"/>`), "pose that is ruled out"],
   ellipse: [drawn('<ellipse cx="15" cy="8" rx="12" ry="5.5" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma)"],
   arc: [drawn('<path d="M2 13q13-15 26 0l-4 2q-9-9-18 0z" fill="var(--cloud)" stroke="var(--ghost)"/>'), "uncertainty (3 sigma): along an arc"],
-  located: [drawn('<circle cx="15" cy="8" r="6.5" fill="var(--cloud)" stroke="var(--ghost)"/><circle cx="15" cy="8" r="2" fill="var(--ghost)"/>'), "where a robot has located an anchor (3 sigma)"],
+  estimated: [drawn('<circle cx="15" cy="8" r="6.5" fill="var(--cloud)" stroke="var(--ghost)"/><circle cx="15" cy="8" r="2" fill="var(--ghost)"/>'), "anchor as a robot estimates it (3 sigma)"],
   contact: [drawn(`${GLOW}<path d="M1 6h28M1 10h28" stroke="var(--link)" stroke-width="1.4"/>`), "in range of each other"],
   reach: [ring("link", 'stroke-dasharray="6 4"'), ({ range }) => `range between robots: ${range}`],
   report: [dot('fill="var(--link)"'), ({ team }) => `report to ${team ? "another" : "the other"} robot`],
@@ -91,7 +91,7 @@ export class Legend {
     const times = Object.entries(TIMES).filter(([kind]) => kinds.has(kind)).map(([kind, words]) => (
       make("li", {}, make("b", { textContent: SIGNS[kind] ?? "4" }), make("span", { textContent: words }))
     ));
-    times.push(entry(BANDS, names.team ? "thickness: not located, to another anchor, located" : "thickness: phase 1, 2, 3"));
+    times.push(entry(BANDS, names.team ? `thickness: ${Object.values(STEPS).join(", ")}` : "thickness: phase 1, 2, 3"));
     const passing = items(MOMENTARY);
     if (passing.length) passing.unshift(title("now"));
     this.list.replaceChildren(...items(LASTING), title("on the time line"), ...times, ...passing);

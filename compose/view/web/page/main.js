@@ -96,8 +96,7 @@ function listen() {
     if (news.show && store) {
       const ahead = store.last;
       store.update(news.show);
-      if (view.follow && store.live && store.last !== ahead) view.tick = Math.max(store.last, 0);
-      else if (view.follow && !store.live && ahead !== store.last) view.tick = Math.max(store.last, 0);
+      if (view.follow && store.last !== ahead) view.tick = Math.max(store.last, 0);
     }
     draw();
   }, () => {
@@ -119,12 +118,10 @@ async function on_list(list) {
   }
   if (list.sweep && !address_state().show) {
     if (store) return void location.assign("/");
-    if ($("sweep").hidden) {
-      text($("title"), await sweep($("sweep")));
-      document.title = `${$("title").textContent} · Tandem`;
-      text($("status"), "sweep");
-    }
-    return;
+    if (!$("sweep").hidden) return;
+    text($("title"), await sweep($("sweep")));
+    document.title = `${$("title").textContent} · Tandem`;
+    return void text($("status"), "sweep");
   }
   const { show, tick } = address_state(); // an address with a tick and no mission is that of the only one at that time
   const chosen = list.shows.find((one) => one.name === show) ?? (list.shows.length === 1 || (!show && tick !== null) ? list.shows[0] : null);
@@ -263,14 +260,9 @@ function advance(now) {
     return;
   }
   const time = view.tick + view.share + s * view.speed;
-  if (time >= store.last) {
-    return void Object.assign(view, { tick: store.last, share: 0, playing: false, follow: store.live });
-  }
+  if (time >= store.last) return void Object.assign(view, { tick: store.last, share: 0, playing: false, follow: store.live });
   const tick = Math.floor(time);
-  if (!store.scene(tick)) {
-    store.want(tick);
-    return;
-  }
+  if (!store.scene(tick)) return void store.want(tick);
   store.wanted = tick;
   view.tick = tick;
   view.share = time - tick;

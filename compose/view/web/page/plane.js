@@ -160,9 +160,7 @@ export class Plane {
     this.following = this.easing = false;
     const { robots, mission } = store.stage, reach = mission.sensing_range;
     const { anchor, orbit } = robots.find((robot) => robot.id === focus) ?? {};
-    if (!truth && anchor) {
-      return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], this.#texts());
-    }
+    if (!truth && anchor) return this.#frame([[anchor, Math.max(reach, orbit[0]) + reach]], this.#texts());
     const chosen = focus && robots.length > 2 ? robots.filter((r) => r.id === focus || r.peer === focus) : robots;
     return this.#frame(scenario_discs(chosen, store), this.#texts());
   }
@@ -282,6 +280,7 @@ export class Plane {
     const cursor = this.hovered ? "pointer" : "";
     if (this.canvas.style.cursor !== cursor) this.canvas.style.cursor = cursor;
     this.labels.draw();
+    this.#backdrop.scale_bar(pen, look);
     this.handles?.draw(this, look, store.stage.robots);
     this.canvas.labels = this.labels.drawn;
     this.canvas.targets = this.targets;

@@ -4,7 +4,7 @@
 import { make } from "./cards.js";
 import { predicted, shown } from "./configurations.js";
 import { joined } from "./tints.js";
-import { metres, turning } from "./words.js";
+import { metres, number, turning } from "./words.js";
 
 const MOST = 8;
 /** The width and height of the strip in pixels. */
@@ -14,7 +14,7 @@ const WIDE = 110, TALL = 30;
 function strip({ reachable, separation_m2 }, omega) {
   const [low, high] = [reachable[0].omega, reachable.at(-1).omega], most = Math.max(separation_m2, ...reachable.map((one) => one.separation_m2));
   const at = (turn, value) => `${(2 + ((WIDE - 4) * (turn - low)) / (high - low || 1)).toFixed(1)} ${(TALL - 3 - ((TALL - 7) * value) / (most || 1)).toFixed(1)}`;
-  const [x, y] = at(omega, separation_m2).split(" "), said = `J over the turn rate from ${low.toFixed(1)} to ${high.toFixed(1)} rad/s; chosen: ${omega.toFixed(2)} rad/s, ${separation_m2.toPrecision(3)} m²`;
+  const [x, y] = at(omega, separation_m2).split(" "), said = `J over the turn rate from ${number(low, 1)} to ${number(high, 1)} rad/s; chosen: ${turning(omega)}, ${separation_m2.toPrecision(3)} m²`;
   return `J over turn rate: ${separation_m2.toPrecision(3)}\u00a0m² at ${turning(omega)} <svg viewBox="0 0 ${WIDE} ${TALL}" width="${WIDE}" height="${TALL}" role="img" aria-label="${said}"><title>${said}</title><path d="M${reachable.map((one) => at(one.omega, one.separation_m2)).join("L")}" fill="none" stroke="var(--faint)" stroke-width="1.5"/>`
     + `<path d="M${x} ${TALL - 2}V${y}" stroke="var(--ink)"/><circle cx="${x}" cy="${y}" r="3" fill="var(--ink)"/></svg>`;
 }

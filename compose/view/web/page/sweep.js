@@ -1,6 +1,7 @@
 // The page of a sweep: its figures, a map of its cells, and a table. A cell plays its worst trial, which the server runs again.
 
 import { make } from "./cards.js";
+import { fact_list, figures_of } from "./estimate.js";
 import { add_time, heat_map } from "./heat.js";
 
 export async function sweep(root) {
@@ -18,19 +19,16 @@ export async function sweep(root) {
     ["cells", rows.length || "none finished yet"], ["trials per cell", trials], ["seed", seed],
   ];
   if (Object.keys(refused).length) facts.push(["cells refused", Object.keys(refused).length]);
-  root.replaceChildren(
-    make("dl", { className: "facts" }, ...facts.map(([what, value]) => make("div", {}, make("dt", { textContent: what }), make("dd", { textContent: value })))),
-  );
+  root.replaceChildren(fact_list(facts));
   if (under_way) root.append(make("p", { className: "note", textContent: "The sweep is running or was stopped. The table shows the cells finished so far." }));
   const said = make("p", { id: "trial", className: "note" });
   said.setAttribute("role", "status");
   if (rows.length) root.append(heat_map(axes, rows, (row, button) => play(row, button, said)), said);
   if (timed) fetch("/api/results/ticks").then(async (found) => { if (found.ok) add_time(root.querySelector(".heat"), await found.json()); });
-  root.append(make("div", { className: "figures" }, ...figures.map((figure) => make("figure", {},
-    make("img", { src: `/api/figures/${encodeURIComponent(figure)}`, alt: figure.replace(".svg", "").replaceAll("-", " "), loading: "lazy" })))));
+  root.append(figures_of(figures));
   if (rows.length) root.append(table(rows, axes));
   const cell = String(rows[0]?.cell ?? 0).padStart(3, "0");
-  root.append(make("p", { className: "note" }, "Individual trials are not recorded. Re-run a trial, bit-identically, with the seed of its row in trials.parquet: ",
+  root.append(make("p", { className: "note" }, "Trials are not recorded. To run one again, to the bit, with the seed of its row in trials.parquet: ",
     make("code", { textContent: `tandem run ${folder}/cells/${cell}.toml --seed SEED --watch` })));
   return name;
 }
@@ -76,4 +74,4 @@ function rate(row) {
   return cell;
 }
 
-const shortened = (text) => (text === "" || text === undefined ? "–" : Number.isFinite(Number(text)) ? String(Number(Number(text).toPrecision(3))) : text);
+const shortened = (text) => (text === "" || text === undefined ? "–" : Number.isFinite(Number(text)) ? String(Number(Number(text).toPrecision(3))).replace("-", "−") : text);

@@ -57,9 +57,7 @@ export class Timeline {
         if (count > 1) lengthen(this.counts.get(player.robot), this.read, count);
         if (player.contacts?.length && !store.estimated) lengthen(this.contacts.get(player.robot), this.read, 1);
       }
-      for (const event of scene.events) {
-        if (event.kind in MARKED) this.marks.push([this.read, event.kind, event.robot]);
-      }
+      for (const event of scene.events) if (event.kind in MARKED) this.marks.push([this.read, event.kind, event.robot]);
     }
   }
 
@@ -136,9 +134,7 @@ export class Timeline {
         }
       }
       pen.fillStyle = of("shade");
-      for (const { from, to } of this.contacts.get(robot.id)) {
-        pen.fillRect(x(from), y - 2, Math.max(x(Math.min(to + 1, this.last)) - x(from), 2), band + 4);
-      }
+      for (const { from, to } of this.contacts.get(robot.id)) pen.fillRect(x(from), y - 2, Math.max(x(Math.min(to + 1, this.last)) - x(from), 2), band + 4);
       pen.textAlign = "center";
       pen.lineWidth = 3;
       for (const { from, to, value } of band > 10 ? this.counts.get(robot.id) : []) {
@@ -170,9 +166,7 @@ export class Timeline {
   /** Draws the signs of each tick side by side, the last first; those that have no room near their tick are left out. */
   #signs(pen, x, of, ids, wide) {
     const ticks = new Map();
-    for (const [k, kind, robot] of this.marks) {
-      if (robot === null || ids.has(robot)) ticks.set(k, (ticks.get(k) ?? new Set()).add(kind));
-    }
+    for (const [k, kind, robot] of this.marks) if (robot === null || ids.has(robot)) ticks.set(k, (ticks.get(k) ?? new Set()).add(kind));
     pen.textAlign = "left";
     let free = wide;
     for (const [k, kinds] of [...ticks].reverse()) {

@@ -3,9 +3,11 @@
 export const PHASES = { 1: "own anchor", 2: "search", 3: "encounter" };
 
 /** What robots of a team do, by phase. */
-export const STEPS = { 1: "not located", 2: "to another anchor", 3: "located" };
+export const STEPS = { 1: "pose unknown", 2: "to another anchor", 3: "pose estimated" };
 
-const number = (value, digits) => value.toFixed(digits).replace("-", "−");
+/** Returns a number with a minus sign; one that rounds to zero has no sign. */
+export const number = (value, digits) => value.toFixed(digits).replace(/^-(?=[0.]+$)/, "").replace("-", "−");
+const signed = (value, digits) => number(value, digits).replace(/^\d/, "+$&");
 
 export function metres(value) {
   const size = Math.abs(value);
@@ -18,9 +20,9 @@ export function metres(value) {
 /** Returns a time in s, to the millisecond. */
 export const seconds = (value) => `${Number(value.toFixed(3))} s`;
 
-export const rad = (value) => `${value < 0 ? "" : "+"}${number(value, 2)} rad`;
+export const rad = (value) => `${signed(value, 2)} rad`;
 export const speed = (value) => `${number(value, 2)} m/s`;
-export const turning = (value) => `${value < 0 ? "" : "+"}${number(value, 2)} rad/s`;
+export const turning = (value) => `${signed(value, 2)} rad/s`;
 export const place = ([x, y]) => `${number(x, 2)}, ${number(y, 2)} m`;
 
 export function probability(value) {
