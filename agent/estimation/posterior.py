@@ -245,10 +245,16 @@ def certainties(found: Posterior) -> list[Certainty]:
     """
     result = []
     for i in range(len(found.hypotheses[0].fit.poses) if found.hypotheses else 0):
-        poses: list[Hypothesis] = []
-        for one in found.hypotheses:
-            if not any(same(one.fit, other.fit)[i] for other in poses):
-                poses.append(one)
+        poses = with_other_poses(found, i)
         total = sum([one.probability for one in poses])
         result.append(Certainty(len(poses), poses[0].probability / total))
     return result
+
+
+def with_other_poses(found: Posterior, robot: int) -> list[Hypothesis]:
+    """Return the most probable hypothesis with each of the poses of a robot, the most probable first."""
+    left: list[Hypothesis] = []
+    for one in found.hypotheses:
+        if not any(same(one.fit, other.fit)[robot] for other in left):
+            left.append(one)
+    return left

@@ -98,7 +98,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
 
     def estimate(self, state: TeamState) -> Estimate:
         """Return all poses of this robot that explain the measurements."""
-        poses = state.poses
+        poses = state.hypotheses
         world = [in_world(state, one) for one in poses]
         total = math.fsum([one.probability for one in poses])
         world = world or ([state.verdict.pose] if isinstance(state.verdict, Localised) else [])
@@ -117,7 +117,7 @@ class TeamPlanner(Planner[TeamState, TeamReport]):
 
     def summary(self, state: TeamState) -> Summary:
         """Return the number of hypotheses, their probability, and what prevents a claim."""
-        entries, poses = state.log.logs[state.own], state.poses
+        entries, poses = state.log.logs[state.own], state.hypotheses
         judged = state.following.judged.get(state.config.robot)
         pairs = [one.following.judged.get(state.config.robot) for one in state.pairs]
         tests = [one.inconsistency for one in (judged, *pairs) if one is not None]

@@ -14,7 +14,7 @@ from agent.estimation.following import ClaimRule, Following
 from agent.estimation.gaussian.claim_agreement import agreed
 from agent.estimation.gaussian.joint_claims import undetermined
 from agent.estimation.gaussian.search import position_sigma
-from agent.estimation.posterior import Hypothesis, certainties, same
+from agent.estimation.posterior import Hypothesis, certainties, with_other_poses
 from agent.estimation.team_measurements import TeamMeasurements
 from agent.peer.team_log import TeamLog
 from agent.planning.state import Bypass
@@ -80,13 +80,6 @@ class TeamEstimate(NamedTuple):
     """The estimate of all poses."""
     why_not: str = UNMET
     """The reason against a claim; empty if there is none."""
-
-
-class LikelyPose(NamedTuple):
-    """A pose of this robot under the most probable hypothesis that has it."""
-
-    probability: float
-    hypothesis: Hypothesis
 
 
 class TeamState(msgspec.Struct, frozen=True):
@@ -155,13 +148,9 @@ class TeamState(msgspec.Struct, frozen=True):
         return part.robots.index(self.config.robot)
 
     @property
-    def poses(self) -> list[LikelyPose]:
-        """The different poses of this robot, the most probable first; none if it is not located."""
-        place, found = self.place, list[LikelyPose]()
-        for one in self.following.known.hypotheses if place is not None else ():
-            if not any(same(one.fit, other.hypothesis.fit)[place or 0] for other in found):
-                found.append(LikelyPose(one.probability, one))
-        return found
+    def hypotheses(self) -> list[Hypothesis]:
+        """The hypotheses with different poses of this robot, likeliest first; none if it is not located."""
+        return with_other_poses(self.following.known, self.place) if self.place is not None else []
 
     @property
     def unverified_anchors(self) -> dict[str, str]:
@@ -259,12 +248,12 @@ def _with_verdict(state: TeamState, verdict: Verdict) -> TeamState:
     return replace(state, verdict=verdict, log=replace(state.log, done=done))
 
 
-def in_world(state: TeamState, pose: LikelyPose) -> Pose:
-    """Return a pose of this robot in <W>, moved by the odometry since its fit."""
+def in_world(state: TeamState, hypothesis: Hypothesis) -> Pose:
+    """Return the pose of this robot in <W> under a hypothesis, moved by the odometry since its fit."""
     part, place = state.following.part, state.place
     assert part is not None
     assert place is not None
-    x, y, heading = pose.hypothesis.fit.poses[place].tolist()
+    x, y, heading = hypothesis.fit.poses[place].tolist()
     at = Pose(part.origin[0] + x, part.origin[1] + y, wrap(heading))
     path = part.paths[place]
     before = Pose(float(path.x[-1]), float(path.y[-1]), float(path.heading[-1]))

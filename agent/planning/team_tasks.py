@@ -22,7 +22,7 @@ from agent.estimation.posterior import Hypothesis
 from agent.planning.active_sensing import AmongBeacons, plan_among
 from agent.planning.drive import pursuit, towards
 from agent.planning.strides import stride
-from agent.planning.team_state import LikelyPose, Spiral, TeamState, Way
+from agent.planning.team_state import Spiral, TeamState, Way
 from agent.planning.travelling import limited, passed
 from protocol.coverage_ticks import coverage_speed
 from protocol.messages import Undecided
@@ -346,16 +346,16 @@ def _seen(state: TeamState) -> list[AmongBeacons]:
         wanted = [k for k in range(len(part.robots)) if k != place]
         if not wanted:
             return []
-    chosen = [LikelyPose(one.probability, one) for one in known] if wanted else state.poses
+    chosen = known if wanted else state.hypotheses
     total = math.fsum([one.probability for one in chosen])
     return [
         AmongBeacons(
             PlanningHypothesis(
                 one.probability / total,
-                one.hypothesis.fit.poses[place],
-                _as_seen(one.hypothesis, place, () if surveys else wanted, wanted if surveys else ()),
+                one.fit.poses[place],
+                _as_seen(one, place, () if surveys else wanted, wanted if surveys else ()),
             ),
-            *_beacons(state, one.hypothesis, wanted if state.wanted else ()),
+            *_beacons(state, one, wanted if state.wanted else ()),
             surveys,
         )
         for one in chosen
