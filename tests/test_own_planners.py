@@ -18,7 +18,7 @@ import tomli_w
 from msgspec.structs import replace
 
 import tandem
-from agent.planning.report_bodies import malformed, report_of
+from agent.planning.planner import malformed, report_of
 from agent.process.report_buffer import ReportBuffer
 from compose.audit.planner_checks import QuietInbox, check_planner
 from compose.audit.rules import audit_run

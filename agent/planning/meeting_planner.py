@@ -14,8 +14,7 @@ from msgspec.structs import replace
 
 from agent.peer import peer_state
 from agent.planning import drive, exchange
-from agent.planning.planner import Planner, Summary
-from agent.planning.report_bodies import decoded
+from agent.planning.planner import Planner, Summary, decoded
 from agent.planning.state import RobotState
 from agent.planning.tasks import Asleep, Deciding, Done, Travelling
 from protocol.messages import Command, Estimate, Observation, Report, RobotConfig

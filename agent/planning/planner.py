@@ -5,6 +5,9 @@ A tick has two halves, because two robots in contact exchange their new measurem
     observe(state, observation) -> state    adds the sensor data; `report(state)` is what the peer receives
     decide(state, reports)      -> state    adds the peer's reports; `command(state)` is the motion command
 
+The body of a report is a `Report`, which is a message itself, or of the planner's own type: then it is
+encoded, and sent in the field `body` of one.
+
 There is no I/O, no clock and no randomness, so simulation, network, replay and recovery make decisions that
 are identical to the bit. A planner is a subclass of `Planner`. Its instances hold options, and never change.
 """
@@ -12,13 +15,26 @@ are identical to the bit. A planner is a subclass of `Planner`. Its instances ho
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cache
 from typing import Any, Generic, TypeVar
 
 import msgspec
 
-from protocol.messages import BranchKind, Command, Estimate, Observation, Probability, RobotConfig
+from protocol.messages import (
+    BranchKind,
+    Command,
+    Estimate,
+    Inconsistent,
+    Observation,
+    Probability,
+    Report,
+    RobotConfig,
+    Undecided,
+    Verdict,
+)
 from protocol.mission import Mission
 from protocol.orbits import Rendezvous, rendezvous
+from protocol.wire import MalformedFrame
 
 S = TypeVar("S")
 """The type of the state of a planner: a frozen value."""
@@ -183,3 +199,55 @@ class Manoeuvres(msgspec.Struct, frozen=True):
 
     No detection selects those placements.
     """
+
+
+# --- the bodies of reports ------------------------------------------------------------------------------
+
+SHORT_REASON = 24
+"""The maximum number of characters of a reason beside a body, so that most of a report is the body."""
+
+
+def report_of(body: Any, tick: int, robot: str, heard: int = 0, verdict: Verdict | None = None) -> Report:
+    """Return the message of `robot` at `tick` with the `body` that its planner has returned.
+
+    `heard` is the tick of the peer's latest report, and `verdict` that of the latest Command.
+    """
+    if isinstance(body, Report):
+        return body
+    match verdict:
+        case Undecided(reason):
+            verdict = Undecided(reason[:SHORT_REASON])
+        case Inconsistent(claim, residual, p_value):
+            verdict = Inconsistent(claim[:SHORT_REASON], residual, p_value)
+    return Report(tick, robot, heard=heard, verdict=verdict, body=msgspec.msgpack.encode(body))
+
+
+def body_of(report: Report, planner: Planner[Any, Any]) -> Any:
+    """Return the body of `report`, as `planner` receives it.
+
+    Raises MalformedFrame if it is not of the planner's type.
+    """
+    return report if planner.BODY is Report else decoded(report, planner)
+
+
+def decoded(report: Report, planner: Planner[Any, Any]) -> Any:
+    """Return what is encoded in `report`, of the type of the planner's bodies. Raises MalformedFrame."""
+    if report.body is None:
+        raise MalformedFrame("a report without a body, and this robot's planner has reports of its own")
+    try:
+        return _decoder(planner.BODY).decode(report.body)
+    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
+        raise MalformedFrame(f"its body: {error}") from None
+
+
+@cache
+def _decoder(body: Any) -> msgspec.msgpack.Decoder[Any]:
+    return msgspec.msgpack.Decoder(body)
+
+
+def malformed(report: Report, planner: Planner[Any, Any]) -> str | None:
+    """Return why the planner's decoder refuses `report`; None if it does not."""
+    try:
+        return planner.malformed(body_of(report, planner))
+    except MalformedFrame as error:
+        return str(error)

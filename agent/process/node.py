@@ -16,7 +16,7 @@ from functools import partial
 
 import zenoh
 
-from agent.planning.report_bodies import malformed
+from agent.planning.planner import malformed
 from agent.process.agent_journal import FramedReport
 from agent.process.discovery import NoWorld, Search, Unwelcome, confirm, join
 from agent.process.link import AgentLink

@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
-from agent.planning.planner import Planner, Summary
-from agent.planning.report_bodies import body_of, report_of
+from agent.planning.planner import Planner, Summary, body_of, report_of
 from agent.process.agent_journal import AgentHistory, FramedReport, Step
 from protocol.journal import environment
 from protocol.journal.journal_file import Sink
@@ -20,7 +19,6 @@ from protocol.messages import (
     Message,
     MissionEnd,
     Observation,
-    Report,
     RobotConfig,
     Verdict,
 )
@@ -47,7 +45,6 @@ class Robot:
         self._encode = encode
         self.config = config
         self.planner = planner
-        self._logs = planner.BODY is Report
         self.state: Any = planner.start(config)
         self.reports: dict[str, FramedReport] = {}
         """The reports of this tick, by the robot in contact to which each is sent."""
@@ -135,12 +132,7 @@ class Robot:
 
         `missed` names the peers whose reports did not arrive in time.
         """
-        bodies: Sequence[Any] = ()
-        if received:
-            bodies = [framed.report for framed in received]
-            if not self._logs:
-                bodies = [body_of(report, self.planner) for report in bodies]
-        self.state = self.planner.decide(self.state, bodies)
+        self.state = self.planner.decide(self.state, [body_of(one.report, self.planner) for one in received])
         self.lost.update([(peer, self.tick) for peer in missed if peer in self._unlisted])
         if received:
             self.reports_received += len(received)

@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from agent.planning.planner import Planner
-from agent.planning.report_bodies import body_of
+from agent.planning.planner import Planner, body_of
 from agent.process.agent_journal import Step
 from agent.process.robot import PlannerReplay, Robot
 from compose.audit.findings import Checks, Violation, unlike

@@ -9,8 +9,7 @@ from typing import Any
 
 import msgspec
 
-from agent.planning.planner import Planner
-from agent.planning.report_bodies import body_of, malformed, report_of
+from agent.planning.planner import Planner, body_of, malformed, report_of
 from compose.errors import PlannerFailed
 from compose.launch.planner_guard import GuardedPlanner
 from protocol.messages import Observation, Report, RobotConfig

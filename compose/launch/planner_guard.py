@@ -10,8 +10,7 @@ from typing import Any
 
 import msgspec
 
-from agent.planning.planner import Planner, Summary
-from agent.planning.report_bodies import body_of, report_of
+from agent.planning.planner import Planner, Summary, body_of, report_of
 from compose.errors import PlannerFailed
 from protocol.messages import Command, Estimate, Observation, Report, RobotConfig
 from protocol.mission import Mission
