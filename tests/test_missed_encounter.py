@@ -177,7 +177,7 @@ def test_in_a_group_all_measurements_count_as_its_plan_has_the_retries() -> None
 
 def test_until_that_tick_the_robot_counts_as_at_rest_without_noise() -> None:
     log, mission = MotionLog().drove(1.0, 0.1, 6).drove(0.5, -0.2, 4), missed(1).mission
-    path, whole = path_of(log, 6, 10, mission), path_of(log, 0, 10, mission)
+    path, whole = path_of(log.runs, 6, 10, mission), path_of(log.runs, 0, 10, mission)
     assert path.x[:7].tolist() == path.y[:7].tolist() == path.heading[:7].tolist() == [0.0] * 7
     moved = [math.hypot(one.x[10] - one.x[6], one.y[10] - one.y[6]) for one in (path, whole)]
     assert moved[0] == pytest.approx(moved[1])

@@ -15,15 +15,15 @@ from agent.estimation.gaussian.consistency import (
 )
 from agent.estimation.gaussian.joint_claims import Displacement, decisive_ranges
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.mission_measurements import m2_of
 from agent.estimation.gaussian.planning_hypotheses import (
     PlanningHypothesis,
     localised,
     planning_hypothesis,
     to_second_order,
 )
+from agent.estimation.knowledge import Knowledge
 from agent.estimation.posterior import Certainty, Hypothesis, Posterior
-from protocol.messages import Inconsistent, Localised, RobotConfig
+from protocol.messages import Inconsistent, Localised
 from protocol.mission import HEADING_ACCURACY
 from protocol.noise import Noise
 
@@ -150,16 +150,13 @@ class Judged(NamedTuple):
 
 
 def of_pair(
-    user: User,
-    config: RobotConfig,
-    scored: Sequence[Hypothesis],
-    pair: JointMeasurements,
+    user: User, knowledge: Knowledge, scored: Sequence[Hypothesis], pair: JointMeasurements
 ) -> Judged | None:
     """Return the estimate of one robot of a pair by the most probable of the hypotheses `scored`, if any."""
     if not scored:
         return None
-    mission, role = config.mission, config.role
-    robot, ids = (0, (config.robot, config.peer)) if role == "a" else (1, (config.peer, config.robot))
+    config, mission = knowledge.config, knowledge.config.mission
+    robot, ids = (0, (config.robot, config.peer)) if config.role == "a" else (1, (config.peer, config.robot))
     required = required_mutual_ranges(mission.noise) if user in FIRST_CLAIMS else 0
     enough = sufficient_mutual_ranges(mission.noise)
     places = len(pair.mutual_places)
@@ -175,7 +172,7 @@ def of_pair(
         hypotheses=len(scored),
         ranges=places,
         required=required,
-        stated=to_second_order(planning_hypothesis(best), m2_of(config)),
+        stated=to_second_order(planning_hypothesis(best), knowledge.m2),
         inconsistency=test,
         accuracy=mission.accuracy,
         headings=tuple([(i, f"{ids[i]}'s", own_heading if i == robot else HEADING_ACCURACY) for i in (0, 1)]),

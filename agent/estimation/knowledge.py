@@ -120,6 +120,13 @@ class Knowledge(msgspec.Struct, frozen=True):
         return self.ranges.get(self.config.peer, ())
 
     @property
+    def m2(self) -> tuple[float, float]:
+        """Return the place (m) of M2 relative to M1, the same bits for both robots."""
+        config = self.config
+        m1, m2 = config.m1, config.peer_anchor if config.role == "a" else config.anchor
+        return m2.x - m1.x, m2.y - m1.y
+
+    @property
     def start(self) -> Pose:
         """Return the pose of tick 0 in the frame of the robot's anchor; known from phase 2 on."""
         assert self.own_anchor.branch is not None

@@ -54,12 +54,8 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
     def of(measured: JointMeasurements) -> Problem:
         """Return the problem of all robots in `measured`, which keep it."""
         known: dict[str, Problem] = measured.__dict__
-        if "problem" not in known:
-            known["problem"] = Problem._built(measured)
-        return known["problem"]
-
-    @staticmethod
-    def _built(measured: JointMeasurements) -> Problem:
+        if "problem" in known:
+            return known["problem"]
         noise, priors, ranges = measured.noise, measured.noise.priors, measured.ranges
         n, lengths = len(measured.paths), tuple([len(path.v) for path in measured.paths])
         ticks = max(lengths, default=0)
@@ -125,7 +121,8 @@ class Problem(msgspec.Struct, frozen=True, eq=False):
             noisy=bool(of.patterns.shape[1]) or bool(of.white.any()) or bool(of.stray.any()),
         )
         log_information = 0.0 if prior is None else prior.log_information
-        return Problem(of, by, Kernel(of, by), noise, order, back, lengths, log_information, ranges.tick)
+        kept = (noise, order, back, lengths, log_information, ranges.tick)
+        return known.setdefault("problem", Problem(of, by, Kernel(of, by), *kept))
 
 
 def _velocities(paths: tuple[Track, ...], ticks: int) -> tuple[Array, Array, Array]:

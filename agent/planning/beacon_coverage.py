@@ -221,7 +221,7 @@ def _measured(state: RobotState) -> JointMeasurements:
     """Return the measurements of the latest meeting: all until its claim, and some of the later ranges."""
     measured = pair_of(state)
     claimed = state.fix.known.tick if state.fix is not None else -1
-    return measured.thinned_after(claimed, MOST_WEIGHED)
+    return measured.thinned(measured.reach, claimed, MOST_WEIGHED)
 
 
 def _with_estimate(state: RobotState, scored: Sequence[Hypothesis], judged: Judged | None) -> RobotState:

@@ -157,8 +157,8 @@ def _estimated(state: RobotState, found: Contacted) -> tuple[Contacted, Localise
         or state.tick < found.estimated_tick + ESTIMATED_EACH
     ):
         return found, None
-    own = MotionLog(state.tick, state.log.between(finder.reference, state.tick))
-    paths = path_of(finder.log, 0, finder.log.through, mission), path_of(own, 0, own.through, mission)
+    own = state.log.between(finder.reference, state.tick)
+    paths = path_of(finder.log.runs, 0, finder.log.through, mission), path_of(own, 0, state.tick, mission)
     estimate = estimated(
         contact_measurements(finder.pose, finder.covariance, paths, ranges, mission), mission
     )

@@ -274,7 +274,7 @@ def surveyed(state: RobotState, manoeuvres: Manoeuvres | None = None) -> RobotSt
         first = state.tick if found.done_tick is None else found.done_tick
         ended = replace(found, kind="three-ranges", done_tick=first)
         return phase2_orbit.surveyed(replace(state, own_anchor=ended))
-    since, objective = next_objective(state, "anchor", (path_of(state.log, 0, state.tick, mission),))
+    since, objective = next_objective(state, "anchor", (path_of(state.log.runs, 0, state.tick, mission),))
     command = plan_alone(anchor_planning_hypotheses(state), mission, objective=objective)
     return state.doing(tasks.Surveying("anchor", command, since))
 

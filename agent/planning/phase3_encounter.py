@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from agent.estimation.estimator import PairEstimate
 from agent.estimation.gaussian.followed_pair import followed
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.mission_measurements import MANY_MUTUAL_RANGES, has_failed, m2_of
+from agent.estimation.gaussian.mission_measurements import MANY_MUTUAL_RANGES, has_failed
 from agent.estimation.gaussian.planning_hypotheses import PlanningHypothesis
 from agent.planning import phase2_orbit, phase3_last_manoeuvre, range_seeking, tasks
 from agent.planning.active_sensing import CONTINUED, next_objective, plan_together
@@ -239,7 +239,7 @@ def surveyed(state: RobotState, planned: JointManoeuvres) -> RobotState:
         resting = "b" if state.config.role == "a" else "a"
     if objective != CONTINUED or resting is not None:
         planned = partial(plan_together, objective=objective, resting=resting)
-    a, b = planned(hypotheses, m2_of(state.config), state.mutual[-1].range, state.config.mission)
+    a, b = planned(hypotheses, state.m2, state.mutual[-1].range, state.config.mission)
     return state.doing(tasks.Surveying("peer", a if state.config.role == "a" else b, since))
 
 

@@ -55,7 +55,7 @@ def difference(
     independent. Claims share the ranges to the robot's own anchor, so they differ by less, and the p-value is
     too large rather than too small. It is 0 if a covariance is singular, which explains no difference.
     """
-    path = path_of(log, 0, through, mission)
+    path = path_of(log.runs, 0, through, mission)
     here, there = (
         Pose(float(path.x[tick]), float(path.y[tick]), float(path.heading[tick])) for tick in (since, through)
     )

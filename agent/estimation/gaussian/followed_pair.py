@@ -26,7 +26,7 @@ from agent.estimation.claim import (
 from agent.estimation.following import SEARCHED_AT
 from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, INCONSISTENT_SEARCHES
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
-from agent.estimation.gaussian.mission_measurements import beginning, m2_of, own_measurements, pair_of
+from agent.estimation.gaussian.mission_measurements import beginning, own_measurements, pair_of
 from agent.estimation.gaussian.own_sensors import DOUBTFUL_CLAIMS, doubt
 from agent.estimation.gaussian.planning_hypotheses import (
     PlanningHypothesis,
@@ -87,12 +87,11 @@ def judged_posterior(
 
     The claim is that of `user`, and the block is the first of the `conditions` that it does not meet.
     """
-    config, scored = knowledge.config, found.hypotheses
-    robot, m2 = 0 if config.role == "a" else 1, m2_of(config)
+    scored, robot, m2 = found.hypotheses, 0 if knowledge.config.role == "a" else 1, knowledge.m2
     claims = [
         localised(to_second_order(planning_hypothesis(one), m2), robot, measured.origin) for one in scored
     ]
-    judged = of_pair(user, config, scored, measured)
+    judged = of_pair(user, knowledge, scored, measured)
     if judged is not None and user == "assured" and not isinstance(knowledge.peer_state.verdict, Localised):
         judged = judged._replace(rivals_of=(0, 1))
     blocking = blocked(judged, conditions)
@@ -156,10 +155,10 @@ def followed_later(
     The whole plane is searched if the `known` hypotheses do not explain it, or if `searched`.
     """
     found = settled(Posterior(PAIR, known.posterior.pair), measured)
-    judged = None if searched else of_pair(user, known.config, found.hypotheses, measured)
+    judged = None if searched else of_pair(user, known, found.hypotheses, measured)
     if blocked(judged, (convergence, consistency)) is not None:
         found = settled(search(measured, found), measured)
-        judged = of_pair(user, known.config, found.hypotheses, measured)
+        judged = of_pair(user, known, found.hypotheses, measured)
     return found.hypotheses, judged
 
 

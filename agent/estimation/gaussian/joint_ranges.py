@@ -308,39 +308,33 @@ class JointMeasurements(msgspec.Struct, frozen=True, dict=True, eq=False):
         variance: Array = np.square(priors.range_scale * ranges.rho) + of_biases
         return variance + np.square(priors.range_delay * self.speeds) if priors.range_delay else variance
 
-    def thinned(self, reach: float) -> JointMeasurements:
+    def thinned(self, reach: float, after: int = -1, most: int | None = None) -> JointMeasurements:
         """Return the measurements with as many ranges as a fit weighs, and none that must be an outlier.
 
-        Of each pair of radios they are all recent ones and some older ones, so that the cost of a tick is
-        bounded. `reach` is the longest range (m) that is expected.
+        They are all up to the tick `after`, and at most `most` of each pair of radios after it: all recent
+        ones and some older ones, so that the cost of a tick is bounded. Of those at one place, fewer are left
+        first. Which of the older ones are left changes only when their number doubles. Of many pairs of
+        robots, fewer are left (see MOST_MUTUAL_RANGES). `reach` is the longest range (m) that is expected.
         """
         ranges = self.ranges
         if ranges.rho.max(initial=0.0) > reach:
-            most = reach + IMPOSSIBLE * np.sqrt(np.square(ranges.sigma) + self.loosened)
-            ranges = ranges if (ranges.rho <= most).all() else ranges.rows(ranges.rho <= most)
-        return msgspec.structs.replace(self, ranges=ranges, reach=reach).thinned_after()
-
-    def thinned_after(self, tick: int = -1, most: int | None = None) -> JointMeasurements:
-        """Return all ranges up to `tick`, and at most `most` of each pair of radios after it.
-
-        Of ranges at one place, fewer are left first. Which of the older ones are left changes only when their
-        number doubles. Of many pairs of robots, fewer are left (see MOST_MUTUAL_RANGES).
-        """
-        ranges, pairs = self.ranges, len(self.ranges.radios)
+            longest = reach + IMPOSSIBLE * np.sqrt(np.square(ranges.sigma) + self.loosened)
+            ranges = ranges if (ranges.rho <= longest).all() else ranges.rows(ranges.rho <= longest)
+        used, pairs = msgspec.structs.replace(self, ranges=ranges, reach=reach), len(ranges.radios)
         if most is None:
             correlated = self.noise.wanders or self.noise.priors.slow_sigma > 0.0
             most = MOST_CORRELATED_RANGES if correlated else MOST_RANGES_BY_EXACT_ODOMETRY
         if len(ranges.rho) <= min(most, MOST_MUTUAL_RANGES // max(pairs, 1)):
-            return self
+            return used
         mutual = [other >= 0 and not self.is_anchor(other) for (_, other), _ in ranges.pairs]
         of_pair = min(most, max(MOST_MUTUAL_RANGES // max(sum(mutual), 1), WEIGHED_OF_PAIR))
         left = np.zeros(len(ranges.rho), bool)
         for (ends, rows), both_drive in zip(ranges.pairs, mutual, strict=True):
-            before = int(np.count_nonzero(ranges.tick[rows] <= tick))
+            before = int(np.count_nonzero(ranges.tick[rows] <= after))
             bound = of_pair if both_drive else most
             left[rows[:before]] = True
-            left[self._weighed(ends, rows[before:], bound)] = True
-        return self if left.all() else msgspec.structs.replace(self, ranges=ranges.rows(left))
+            left[used._weighed(ends, rows[before:], bound)] = True
+        return used if left.all() else msgspec.structs.replace(used, ranges=ranges.rows(left))
 
     def _weighed(self, ends: tuple[int, int], rows: Places, most: int) -> Places:
         """Return at most `most` of the `rows` of the pair of radios at both `ends`.

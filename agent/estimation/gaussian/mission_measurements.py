@@ -15,11 +15,9 @@ from agent.estimation.gaussian.joint_ranges import JointMeasurements, Silence
 from agent.estimation.gaussian.measured_rows import Listed, near_anchors
 from agent.estimation.gaussian.odometry_noise import Places, Track, track, variances
 from agent.estimation.knowledge import Knowledge
-from agent.peer.motion_log import MotionLog
-from protocol.messages import Ranged, RobotConfig
+from protocol.messages import Ranged
 from protocol.mission import Mission
 from protocol.motion import Segment
-from protocol.noise import VelocityNoise
 
 MANY_MUTUAL_RANGES = 60
 """The number of mutual ranges after which a lack of accuracy is due to too few ranges to the anchor.
@@ -69,27 +67,23 @@ def has_failed(knowledge: Knowledge, before: int, tick: int) -> bool:
     return count >= MANY_MUTUAL_RANGES
 
 
-def path_of(log: MotionLog, first: int, through: int, mission: Mission) -> Track:
-    """Return the odometry of `log` up to tick `through`, as if it had not moved until `first`."""
-    return _path_of(log.runs, first, through, mission.period, mission.noise.odometry)
-
-
 @lru_cache(maxsize=4)
-def _path_of(
-    runs: tuple[Segment, ...], first: int, through: int, period: float, noise: VelocityNoise
-) -> Track:
-    """Return the path of `path_of`, which robots ask for several times in a tick."""
+def path_of(runs: tuple[Segment, ...], first: int, through: int, mission: Mission) -> Track:
+    """Return the odometry of `runs` up to tick `through`, as if it had not moved until `first`.
+
+    Robots ask for it several times in a tick.
+    """
     ticks = [run.ticks for run in runs]
     v, omega = (
         np.repeat(one, ticks)[:through] for one in ([run.v for run in runs], [run.omega for run in runs])
     )
     v[:first] = omega[:first] = 0.0
     # -0.0 and 0.0 are the same to the cache
-    path = track(v + 0.0, omega + 0.0, period)
+    path = track(v + 0.0, omega + 0.0, mission.period)
     if first == 0:
         return path
     extra = np.zeros((2, len(v)))
-    extra[:, :first] = -variances(v[:first], omega[:first], noise)
+    extra[:, :first] = -variances(v[:first], omega[:first], mission.noise.odometry)
     return path._replace(extra=extra)
 
 
@@ -108,7 +102,7 @@ def own_measurements(knowledge: Knowledge) -> JointMeasurements:
     first = beginning(knowledge, now) if knowledge.config.role == "a" else 0
     ranges, silent = _within(knowledge.log.ranges, first, now)
     own = near_anchors(
-        [path_of(knowledge.log, first, now, mission)],
+        [path_of(knowledge.log.runs, first, now, mission)],
         *([ranges], [(0.0, 0.0)], mission.noise, mission.sensing_range),
         silent=(Silence(0, -1, silent),),
     )
@@ -130,15 +124,9 @@ def pair_of(knowledge: Knowledge) -> JointMeasurements:
     of_b, b_silent = _within(b.ranges, 0, b_end)
     mutual, both_silent = _within(knowledge.mutual, first, last)
     measured = near_anchors(
-        (path_of(a, first, a_end, mission), path_of(b, 0, b_end, mission)),
-        *((of_a, of_b), ((0.0, 0.0), m2_of(config)), mission.noise, mission.sensing_range, mutual),
+        (path_of(a.runs, first, a_end, mission), path_of(b.runs, 0, b_end, mission)),
+        *((of_a, of_b), ((0.0, 0.0), knowledge.m2), mission.noise, mission.sensing_range, mutual),
         silent=(Silence(0, -1, a_silent), Silence(1, -1, b_silent), Silence(0, 1, both_silent)),
     )
     measured = replace(measured, origin=(config.m1.x, config.m1.y), solver=knowledge.solver)
     return measured.thinned(mission.sensing_range)
-
-
-def m2_of(config: RobotConfig) -> tuple[float, float]:
-    """Return the place (m) of M2 relative to M1."""
-    m1, m2 = config.m1, config.peer_anchor if config.role == "a" else config.anchor
-    return m2.x - m1.x, m2.y - m1.y  # the same bits for both robots
