@@ -7,13 +7,14 @@ import math
 import os
 import subprocess
 import sys
+from collections.abc import Sequence
 from fractions import Fraction
 from functools import partial
 from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
@@ -27,7 +28,7 @@ from agent.estimation.gaussian.measured_rows import near_anchors
 from agent.estimation.gaussian.odometry_noise import track
 from agent.estimation.kernel import Kernel
 from agent.estimation.problem import Problem
-from agent.estimation.smoother import Array, Measured, Singular, effect_of
+from agent.estimation.smoother import LARGEST_TURN, Array, Measured, Singular, Walk, effect_of
 from protocol.motion import Pose, step
 from protocol.noise import Noise, VelocityNoise
 from tests.moving_groups import NOISE, PERIOD_S, joint_measurements, moving_group
@@ -108,6 +109,171 @@ def test_the_kernel_equals_its_text_to_the_bit(
     for name, one in kernel.step(*given)._asdict().items():
         expected = getattr(smoother.step(of, *given), name)
         assert np.asarray(one).tobytes() == np.asarray(expected).tobytes(), name
+
+
+# --- a step, by the solution for all unknowns at once -----------------------------------------------------
+
+TINY = 1e-5
+"""The step of a numerical derivative, in m, rad and their rates."""
+
+
+def start_of(of: Measured, guess: Array) -> Array:
+    """Return the start poses with these pivots in the robots' frames, and headings; see `Kernel.guess`."""
+    poses = guess.copy()
+    for i, pivot in enumerate(of.pivot):
+        c, s = np.cos(guess[3 * i + 2]), np.sin(guess[3 * i + 2])
+        poses[3 * i : 3 * i + 2] = pivot - np.array(((c, -s), (s, c))) @ guess[3 * i : 3 * i + 2]
+    return poses
+
+
+def derivatives(
+    kernel: Kernel, at: Sequence[Array], deep: Sequence[float]
+) -> tuple[list[Array], list[Array]]:
+    """Return those of the ranges and of the last poses, by start poses, constant and white errors.
+
+    `at` are the guess of the poses, and the errors; `deep` are the shares of depth.
+    """
+    of, here = kernel.of, np.concatenate([one.ravel() for one in at])
+    parts = np.cumsum([one.size for one in at])[:-1]
+
+    def predicted(unknowns: Array) -> Array:
+        guess, constant, white = np.split(unknowns, parts)
+        errors = constant.reshape(at[1].shape), white.reshape(at[2].shape)
+        walk = kernel.walked(start_of(of, guess), *errors, deep)
+        distances = of.rho - walk.residual
+        if of.deep >= 0:
+            shares = of.common[:, of.deep :] * deep
+            distances = distances + shares[:, 0] * walk.to_depth + shares[:, 1] * walk.aside
+        return np.concatenate((distances, walk.place[:, -1].ravel()))
+
+    sides = [predicted(here + one) - predicted(here - one) for one in TINY * np.eye(len(here))]
+    both = np.stack(sides, -1) / (2.0 * TINY)
+    return [np.split(one, parts, axis=1) for one in (both[: len(of.rho)], both[len(of.rho) :])]
+
+
+def common_effects(of: Measured, walk: Walk) -> Array:
+    """Return the effects (m) of one sigma of each constant error on the ranges; shape (N, c)."""
+    effects = of.common.copy()
+    if of.scaled >= 0:
+        predicted = of.scale * (of.rho - walk.residual)
+        effects[:, of.scaled] = np.where(of.common[:, of.scaled] == 0.0, 0.0, predicted)
+    if of.delayed >= 0:
+        effects[:, of.delayed] = -of.common[:, of.delayed] * walk.rate
+    if of.deep >= 0:
+        effects[:, of.deep :] = of.common[:, of.deep :] * np.stack((walk.to_depth, walk.aside), -1)
+    return effects
+
+
+def slow_covariance(of: Measured) -> Array:
+    """Return the covariance (m^2) of the slow errors of all ranges; shape (N, N)."""
+    tick = np.searchsorted(of.begin, np.arange(len(of.rho)), side="right") - 1
+    alike = (of.radio[:, None] == of.radio) & (of.radio >= 0) & (of.radios > 0)
+    return np.asarray(alike * of.slow * of.decay ** np.abs(tick[:, None] - tick))
+
+
+@settings(max_examples=25, deadline=None)
+@given(
+    st.integers(0, 10**6),
+    st.integers(1, 3),
+    st.integers(4, 9),
+    st.sampled_from([0.0, 0.08]),
+    st.sampled_from([0.0, 0.1]),
+    st.booleans(),
+    st.sampled_from([-1, 1]),
+    st.sampled_from([0.0, 0.2]),
+    st.sampled_from([0.0, 0.5]),
+    st.sampled_from([0.3, 1e9]),
+)
+def test_a_step_is_the_solution_for_all_unknowns_at_once(
+    seed: int,
+    robots: int,
+    ticks: int,
+    slow: float,
+    survey: float,
+    prior: bool,
+    scaled: int,
+    delay: float,
+    depth: float,
+    largest: float,
+) -> None:
+    """It has no filter and no backward pass: white and slow errors are a dense covariance of the ranges."""
+    errors = {"slow": slow, "survey": survey, "delay": delay, "depth": depth, "strays": 0.05}
+    problem = problem_of(seed, robots, ticks, prior=prior, **errors)
+    of, variance = problem.measured._replace(scaled=scaled), np.square(problem.weighing.sigma)
+    assume(not np.isnan(of.pivot).any())
+    of.radio[::3] = -1
+    n3, count, deep = 3 * of.robots, len(of.rho), (0.7, -0.4)
+    kernel, (poses, constant, white) = Kernel(of, problem.weighing), point_of(of, seed)
+    walk = kernel.walked(poses, constant, white, deep)
+    assume(float(np.min(of.rho - walk.residual)) > 0.2)
+    at = kernel.guess(poses), constant, white
+    (by_start, by_constant, by_white), last_by = derivatives(kernel, at, deep)
+    effects, noise = common_effects(of, walk), np.diag(of.white.ravel())
+    of_slow = slow_covariance(of)
+    covariance = np.diag(variance) + of_slow + by_white @ noise @ by_white.T
+    inverse, by_unknown = np.linalg.inv(covariance), np.hstack((by_start, effects, by_constant))
+    basis = np.stack([(start_of(of, at[0] + e) - start_of(of, at[0] - e)) for e in TINY * np.eye(n3)], -1)
+    basis /= 2.0 * TINY
+    information = by_unknown.T @ inverse @ by_unknown
+    information[:n3, :n3] += basis.T @ of.information @ basis
+    information[n3:, n3:] += np.eye(len(information) - n3)
+    assume(np.linalg.cond(information) < 1e7)
+    step = kernel.step(walk, poses, variance, 0.0, largest)
+    # the errors of the odometry are relative to 0, the poses to the point
+    left = walk.residual + by_constant @ constant.ravel() + by_white @ white.ravel()
+    gradient, weighted, spread = (
+        by_unknown.T @ inverse @ left,
+        inverse @ by_unknown,
+        np.linalg.inv(information),
+    )
+    gradient[:n3] += basis.T @ of.information @ (of.mean - poses)
+    change = spread @ gradient
+    misfit = inverse @ (left - by_unknown @ change)
+
+    def near(expected: Array) -> object:
+        return pytest.approx(
+            expected, rel=1e-4, abs=1e-5 * max(1.0, float(np.abs(expected).max(initial=0.0)))
+        )
+
+    assert step.change == near(change)
+    assert step.inverse == near(spread)
+    assert step.multipliers == near(misfit)
+    assert step.alone == near(np.diagonal(inverse))
+    assert step.explained == near(np.einsum("ja,ab,jb->j", weighted, spread, weighted))
+    off = of.mean - poses - basis @ change[:n3]
+    chi2 = misfit @ covariance @ misfit + change[n3:] @ change[n3:] + off @ of.information @ off
+    assert step.chi2 == pytest.approx(chi2, rel=1e-4, abs=1e-6)
+    determinants = np.linalg.slogdet(covariance)[1] + np.linalg.slogdet(information)[1]
+    assert step.volume == pytest.approx(determinants, rel=1e-4, abs=1e-3)
+    assert step.of_start == pytest.approx(np.linalg.slogdet(spread[:n3, :n3])[1], rel=1e-4, abs=1e-3)
+    length = change[:n3] @ np.linalg.solve(spread[:n3, :n3], change[:n3])
+    assert step.length == pytest.approx(math.sqrt(length), rel=1e-4)
+    # the limited step, with the best constant errors beside it
+    shares = np.abs(change[:n3]) / np.tile((largest, largest, LARGEST_TURN), of.robots)
+    limited = change[:n3] / max(1.0, float(shares.max()))
+    beside = np.linalg.solve(information[n3:, n3:], gradient[n3:] - information[n3:, :n3] @ limited)
+    assert step.limited == near(np.concatenate((limited, beside)))
+    own = inverse @ (left - by_unknown @ step.limited)
+    assert step.own == near(own)
+    assert step.white.ravel() == near(noise @ by_white.T @ own)
+    assert step.slow == near(of_slow @ own)
+    # what all data tell of the errors in a tick
+    remaining = inverse - weighted @ spread @ weighted.T
+    by_ticks = by_white.reshape(count, of.robots, 2, of.ticks)
+    for i, k in np.ndindex(of.robots, of.ticks):
+        both = by_ticks[:, i, :, k]
+        (vv, mixed), (_, omega) = both.T @ remaining @ both
+        assert step.shocks[i, k] == near(np.array((*(both.T @ misfit), vv, mixed, omega)))
+    # the last poses, with the errors of surveying, which are considered
+    attributed = last_by[2] @ noise @ by_white.T @ inverse
+    last = np.hstack((last_by[0], np.zeros((n3, effects.shape[1])), last_by[1])) - attributed @ by_unknown
+    surveyed = np.zeros((count, 2 * of.anchors))
+    for j in np.flatnonzero(of.anchor >= 0):
+        surveyed[j, 2 * of.anchor[j] : 2 * of.anchor[j] + 2] = of.survey * walk.direction[j]
+    by_survey = (attributed + last @ spread @ weighted.T) @ surveyed
+    known = noise - noise @ by_white.T @ inverse @ by_white @ noise
+    expected = last @ spread @ last.T + last_by[2] @ known @ last_by[2].T + by_survey @ by_survey.T
+    assert step.ends == near(expected)
 
 
 def bits(of: Fitted | Point | tuple[object, ...]) -> list[bytes]:
