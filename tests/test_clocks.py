@@ -117,7 +117,7 @@ def test_an_agent_gives_up_on_the_answer_to_its_last_message_when_its_wait_is_ov
 ) -> None:
     """A clock in memory, which only waits advance, would otherwise stand still for ever."""
     config, inbox = load("paper-1").config("a", None), Silence()
-    process = AgentProcess(Memory(config, Robot(config, planner_of(config))), "silent", inbox)
+    process = AgentProcess(Memory(Robot(config, planner_of(config))), "silent", inbox)
     link = SimpleNamespace(command=len, next=lambda until: inbox.next(until - inbox.clock()))
     process._link = cast(Any, link)
     inbox.now, inbox._asleep = now, suspended  # the sum of both is rounded

@@ -23,7 +23,6 @@ from agent.estimation.gaussian.noise_level import INLIER
 from agent.estimation.gaussian.odometry_noise import Array
 from agent.estimation.gaussian.own_sensors import contradiction
 from agent.estimation.judged import EVERYBODY, FIRST_CLAIMS, Judged, User, sufficient_mutual_ranges
-from protocol.messages import Localised
 
 EARLY_RANGES = 16
 """The number of mutual ranges below which EARLY_CLAIM_P_VALUE applies.
@@ -324,11 +323,3 @@ def blocked(judged: Judged | None, conditions: Sequence[Condition] = CONDITIONS)
         if judged.user in one.users and (reason := one.blocks(judged)):
             return Blocked(one, reason)
     return None
-
-
-def claim(judged: Judged | None) -> Localised | Blocked:
-    """Return the claim of a robot's pose in <W>, or the first condition that is not met."""
-    if (found := blocked(judged)) is not None:
-        return found
-    assert judged is not None
-    return judged.localised

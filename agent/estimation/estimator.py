@@ -10,7 +10,7 @@ from __future__ import annotations
 from typing import NamedTuple, Protocol
 
 from agent.estimation.closed_forms import Placement
-from agent.estimation.exact import Branch, PairObservation
+from agent.estimation.exact import Branch
 from agent.estimation.knowledge import Knowledge, MeetingPosterior, OwnAnchor
 from protocol.messages import Observation, Verdict
 from protocol.motion import ORIGIN, Pose
@@ -48,8 +48,6 @@ class PairEstimate(NamedTuple):
     """The pose of b; in <b(M2)>, or the origin of a frame of its own."""
     checked: bool = False
     """True if a redundant mutual range has confirmed the placements."""
-    observations: tuple[PairObservation, ...] = ()
-    """The ticks from which the placements follow; empty if the posterior has their covariance instead."""
 
 
 class Estimator(Protocol):

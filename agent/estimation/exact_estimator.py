@@ -111,7 +111,7 @@ class ExactEstimator(msgspec.Struct, frozen=True):
             verdict = Localised(knowledge.world_pose(remaining[0]))
         failure = "does not select a placement" if checked else "could not be measured: b left a's range"
         latest, failure = observations[-1], f"the third mutual range {failure}"
-        return PairEstimate(posterior, verdict, remaining, failure, latest.a, latest.b, checked, observations)
+        return PairEstimate(posterior, verdict, remaining, failure, latest.a, latest.b, checked)
 
 
 def _with_placements(

@@ -14,7 +14,7 @@ from functools import partial
 
 from msgspec.structs import astuple, replace
 
-from agent.estimation.claim import NORMAL_RATIO, Blocked, claim
+from agent.estimation.claim import NORMAL_RATIO, blocked
 from agent.estimation.gaussian.followed_pair import followed_later
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
 from agent.estimation.gaussian.mission_measurements import pair_of
@@ -256,9 +256,9 @@ def _reference(state: RobotState, judged: Judged | None) -> ReportedPose | None:
     if judged is not None and own_pose.ranges_when_lost is not None:
         required = own_pose.ranges_when_lost + RANGES_AGAIN
         judged = judged._replace(ranges=own_pose.ranges, required=required)
-    found = claim(judged)
-    if judged is None or isinstance(found, Blocked):
+    if judged is None or blocked(judged) is not None:
         return None
+    found = judged.localised
     assert found.covariance is not None
     factor = max(NORMAL_RATIO / min(judged.rival.log_likelihood_ratio, -SMALLEST_LOSS), 1.0)
     covariance = Covariance(*[factor * one for one in astuple(found.covariance)])

@@ -257,10 +257,8 @@ class LogPlanner(Planner[RobotState, Report]):
     def estimate(self, state: RobotState) -> Estimate:
         """Return the robot's pose under each hypothesis, in its anchor's frame and in <W>."""
         own, posterior, verdict = state.own_anchor, state.posterior, state.verdict
-        branches_left = own.branches
-        if not branches_left and own.branch is not None:
-            branches_left = (own.branch,)
-        elif not branches_left and isinstance(state.task, tasks.ThirdPoint):
+        branches_left = own.branches or ((own.branch,) if own.branch is not None else ())
+        if not branches_left and isinstance(state.task, tasks.ThirdPoint):
             branches_left = state.task.branches
         if posterior.poses:
             world: tuple[Pose, ...] = state.poses

@@ -115,7 +115,9 @@ def last_manoeuvre(state: RobotState, estimate: PairEstimate, planned: PlannedLa
     question = Question(state.config.role, estimate.a, estimate.b, tuple(estimate.placements))
     mission = state.config.mission
     if estimate.checked and len(estimate.placements) == 1:
-        plan = phase3_last_manoeuvre.most_informative_manoeuvre(question, estimate.observations, mission)
+        plan = phase3_last_manoeuvre.most_informative_manoeuvre(
+            question, state.posterior.observations, mission
+        )
     else:
         plan = planned(question, mission)
     if plan is None:
@@ -178,7 +180,7 @@ def decided(state: RobotState, planned: PlannedLast) -> RobotState:
         return state
     # A peer that has localised itself does not move again.
     if not isinstance(state.peer_state.verdict, Localised):
-        turn = phase3_last_manoeuvre.turn(estimate.observations) if estimate.checked else "b"
+        turn = phase3_last_manoeuvre.turn(state.posterior.observations) if estimate.checked else "b"
         if state.config.role != turn or state.peer_state.state not in PEER_RESTS:
             return state
     return last_manoeuvre(state, estimate, planned) or state

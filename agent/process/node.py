@@ -69,7 +69,7 @@ class AgentProcess:
         that the world has gone: its launcher does. `on_kill_point` is called with the name of each step
         within a tick and the tick, so that a scheduled kill can happen there.
         """
-        config = memory.config
+        config = memory.robot.config
         self._others = {*config.others}
         self._inbox = inbox
         self._timeout = timeout

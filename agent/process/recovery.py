@@ -27,9 +27,8 @@ It is smaller than REPORTS_KEPT. Otherwise the peer would count a report twice.
 
 
 class Memory(msgspec.Struct, frozen=True):
-    """A robot, with the state of its process. Only `config` and `robot` are set for a new robot."""
+    """A robot, with the state of its process. Only `robot` is set for a new one."""
 
-    config: RobotConfig
     robot: Robot
     observation: Observation | None = None
     """The latest Observation."""
@@ -71,8 +70,7 @@ def remember(recording: Retrace, planner_of: Callable[[RobotConfig], Planner[Any
     tick = observation.tick if observation is not None else 0
     latest = journal.steps[-REPORTS_KEPT:]
     return Memory(
-        config=journal.config,
-        robot=robot,
+        robot,
         observation=observation,
         own_reports=tuple(own_reports),
         received=tuple(

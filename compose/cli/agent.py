@@ -65,7 +65,7 @@ def _run(options: argparse.Namespace, inbox: Inbox) -> MissionEnd:
                 f"run '{run}' uses the planner '{name}', which this command does not name; if you trust "
                 f"its code on this machine, add --planner {name}"
             )
-        if memory is not None and old is not None and memory.config != config:
+        if memory is not None and old is not None and memory.robot.config != config:
             raise CorruptJournal(
                 f"{old.path}: belongs to another run: its configuration does not match the world's"
             )
@@ -119,6 +119,6 @@ def _ready(
     elif options.out is not None:
         journal = Journal(options.out / agent_journal(options.id), fsync=options.fsync)
     if memory is None:
-        return Memory(config, Robot(config, planner_loader.planner_of(config), journal))
+        return Memory(Robot(config, planner_loader.planner_of(config), journal))
     memory.robot.append_to(journal)
     return memory

@@ -409,7 +409,7 @@ def agent_process(network: VirtualNetwork, process: VirtualProcess) -> None:
     memory = remember(old, planner_of) if old is not None else None
     with old.open_for_append()[0] if old is not None else Journal(path) as journal:
         if memory is None:
-            memory = Memory(config, Robot(config, planner_of(config), journal))
+            memory = Memory(Robot(config, planner_of(config), journal))
         memory.robot.append_to(journal)
         agent = AgentProcess(memory, launched=True, **process.arguments())
         while True:

@@ -17,7 +17,6 @@ from agent.estimation.claim import (
     Blocked,
     Condition,
     blocked,
-    claim,
     consistency,
     convergence,
     profiles,
@@ -167,9 +166,9 @@ def later_pose(met: Knowledge, now: Knowledge) -> Localised | None:
 
     `met` is the robot's knowledge at that claim, and `now` has its later odometry and ranges to its anchor.
     Its heading in <W> follows from the meeting alone, but beside its anchor its position hardly depends on
-    that. The conditions are those of `claim`, after a search of the whole plane. Without it, a fit after a
+    that. All conditions are asked, after a search of the whole plane. Without it, a fit after a
     long way was 0.3 m off, with a sigma of 0.02 m.
     """
     met = replace(met, tick=now.tick, odometry=now.odometry, log=now.log)
-    claimed = claim(followed_later("meeting", met, pair_of(met), searched=True)[1])
-    return claimed if isinstance(claimed, Localised) else None
+    _, judged = followed_later("meeting", met, pair_of(met), searched=True)
+    return None if judged is None or blocked(judged) is not None else judged.localised
