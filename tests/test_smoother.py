@@ -17,6 +17,7 @@ import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
+from numpy.typing import NDArray
 
 import agent
 from agent.estimation import elementary, gauss_newton, smoother
@@ -148,7 +149,7 @@ def derivatives(
 
     sides = [predicted(here + one) - predicted(here - one) for one in TINY * np.eye(len(here))]
     both = np.stack(sides, -1) / (2.0 * TINY)
-    return [np.split(one, parts, axis=1) for one in (both[: len(of.rho)], both[len(of.rho) :])]
+    return np.split(both[: len(of.rho)], parts, axis=1), np.split(both[len(of.rho) :], parts, axis=1)
 
 
 def common_effects(of: Measured, walk: Walk) -> Array:
@@ -230,7 +231,7 @@ def test_a_step_is_the_solution_for_all_unknowns_at_once(
     change = spread @ gradient
     misfit = inverse @ (left - by_unknown @ change)
 
-    def near(expected: Array) -> object:
+    def near(expected: NDArray[np.floating]) -> object:
         return pytest.approx(
             expected, rel=1e-4, abs=1e-5 * max(1.0, float(np.abs(expected).max(initial=0.0)))
         )

@@ -7,7 +7,7 @@ as the mission asks, in the phases of the paper (`phase1_anchor`, `phase2_orbit`
 
 from __future__ import annotations
 
-from agent.planning import drive, exchange, phase1_anchor, phase2_orbit, phase3_encounter, tasks
+from agent.planning import drive, phase1_anchor, phase2_orbit, phase3_encounter, tasks
 from agent.planning.exchange import LogPlanner, Steps
 from agent.planning.phase3_last_manoeuvre import LAST_SPEEDS
 from agent.planning.planner import Manoeuvres
@@ -34,7 +34,7 @@ class Assured(LogPlanner):
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return exchange.command(state, REST if _must_wait(state) else drive.controls(state))
+        return drive.command(state, REST if _must_wait(state) else drive.controls(state))
 
 
 def _must_wait(state: RobotState) -> bool:

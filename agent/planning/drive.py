@@ -1,15 +1,16 @@
-"""The controls of each task: how the robot drives in the next tick."""
+"""The controls of each task, and the command: how the robot drives in the next tick."""
 
 from __future__ import annotations
 
 import math
 
 from agent.planning import tasks
-from agent.planning.separation import leeway
+from agent.planning.separation import leeway, leeway_of_each, slowed
 from agent.planning.state import RobotState
 from agent.planning.tasks import Beacon
 from protocol.coverage_strips import Place
 from protocol.coverage_ticks import coverage_speed
+from protocol.messages import Command
 from protocol.mission import Mission
 from protocol.motion import REST, TAU, Controls, Pose, relative, travelled, wrap
 from protocol.orbits import Orbit
@@ -55,6 +56,40 @@ def controls(state: RobotState) -> Controls:
             return Controls(min(way.v, coverage_speed(mission)), way.omega)
         case _:
             return REST
+
+
+def command(state: RobotState, controls: Controls) -> Command:
+    """Return the command with `controls`, limited by the safety distance, the task and the verdict."""
+    config = state.config
+    if state.in_contact and config.mission.safety_distance:
+        controls = _safe(state, controls)
+    return Command(
+        state.tick,
+        config.robot,
+        controls.v,
+        controls.omega,
+        state.phase,
+        state.task.name,
+        state.verdict,
+        config.peer,
+        config.role,
+        rests=state.verdict is not None,
+    )
+
+
+def _safe(state: RobotState, controls: Controls) -> Controls:
+    """Return `controls` for the next tick, limited so that the safety distance is kept.
+
+    The peer is in contact. The limit applies while the robot does not plan with the peer's position: before
+    phase 3, and on the way back into range.
+    """
+    mission = state.config.mission
+    if state.phase == 3 and not isinstance(state.task, tasks.Retreating):
+        return controls
+    if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
+        return REST
+    aside = bool(state.passing.places) and tasks.drives_aside(state.task)
+    return slowed(controls, leeway_of_each(state.mutual[-1].range, mission, aside=aside), mission)
 
 
 def _seeking(state: RobotState, task: tasks.Searching) -> Controls:

@@ -21,7 +21,6 @@ from agent.planning import (
     phase3_last_manoeuvre,
     plausibility,
     range_seeking,
-    separation,
     tasks,
     travelling,
 )
@@ -40,7 +39,7 @@ from protocol.messages import (
     Verdict,
 )
 from protocol.mission import Mission
-from protocol.motion import REST, Controls, Pose, compose, inverse, step
+from protocol.motion import Controls, Pose, compose, inverse, step
 
 
 def observed(state: RobotState, observation: Observation) -> RobotState:
@@ -103,41 +102,6 @@ def report_without_log(state: RobotState, verdict: Verdict | None) -> Report:
         ranges_since=len(state.log.ranges),
         verdict=verdict,
     )
-
-
-def command(state: RobotState, controls: Controls) -> Command:
-    """Return the command with `controls`, limited by the safety distance, the task and the verdict."""
-    config = state.config
-    if state.in_contact and config.mission.safety_distance:
-        controls = _safe(state, controls)
-    return Command(
-        state.tick,
-        config.robot,
-        controls.v,
-        controls.omega,
-        state.phase,
-        state.task.name,
-        state.verdict,
-        config.peer,
-        config.role,
-        rests=state.verdict is not None,
-    )
-
-
-def _safe(state: RobotState, controls: Controls) -> Controls:
-    """Return `controls` for the next tick, limited so that the safety distance is kept.
-
-    The peer is in contact. The limit applies while the robot does not plan with the peer's position: before
-    phase 3, and on the way back into range.
-    """
-    mission = state.config.mission
-    if state.phase == 3 and not isinstance(state.task, tasks.Retreating):
-        return controls
-    if not state.mutual or state.mutual[-1].tick != state.tick:  # the range was not measured
-        return REST
-    aside = bool(state.passing.places) and tasks.drives_aside(state.task)
-    free = separation.leeway_of_each(state.mutual[-1].range, mission, aside=aside)
-    return separation.slowed(controls, free, mission)
 
 
 class Steps(NamedTuple):
@@ -229,7 +193,7 @@ class LogPlanner(Planner[RobotState, Report]):
 
     def command(self, state: RobotState) -> Command:
         """Return the command for the next tick, with the phase, the task and the verdict."""
-        return command(state, drive.controls(state))
+        return drive.command(state, drive.controls(state))
 
     def report(self, state: RobotState) -> Report:
         """Return the report of this tick: the part of the log that the peer has not acknowledged.

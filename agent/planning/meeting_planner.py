@@ -82,9 +82,9 @@ class MeetingPlanner(Planner[RobotState, Report]):
         if isinstance(state.task, Done):
             decides = state.in_contact  # the peer may need further ranges
         if not decides:
-            return exchange.command(state, drive.controls(state))
+            return drive.command(state, drive.controls(state))
         command = self._planner.command(self._own(state))
-        return exchange.command(state, Controls(command.v, command.omega))
+        return drive.command(state, Controls(command.v, command.omega))
 
     def estimate(self, state: RobotState) -> Estimate:
         """Return the estimate of the user's planner."""
