@@ -4,14 +4,18 @@
 from __future__ import annotations
 
 import math
+import os
+import threading
 import time
 from collections.abc import Sequence
+from pathlib import Path
 from random import Random
 from typing import Any
 
 import msgspec
 from msgspec.structs import replace
 
+from protocol.network import watchdog
 from tandem.planning import (
     Assured,
     Command,
@@ -133,6 +137,22 @@ class Idle(Planner[int, None]):
 
 class Incomplete(Planner[int, None]):
     """It defines nothing."""
+
+
+class Hanging(Assured):
+    """The planner `assured`, whose process hangs in a call of Zenoh once, at tick 5 of b.
+
+    The file that the environment variable HUNG_ONCE names tells that it has.
+    """
+
+    def decide(self, state: RobotState, reports: Sequence[Report] = ()) -> RobotState:
+        hung = Path(os.environ["HUNG_ONCE"])
+        if state.config.robot == "b" and state.tick == 5 and not hung.exists():
+            hung.touch()
+            watchdog.CALL.longest_s = 1.0
+            with watchdog.CALL:
+                threading.Event().wait()
+        return super().decide(state, reports)
 
 
 class Suited(Assured):

@@ -410,7 +410,7 @@ def rage(
                     due = next(looks)
                 shot = storm.shot(tick)
                 if shot.frame is None:
-                    publishers[shot.key].delete()
+                    publishers[shot.key].declared.delete()
                 else:
                     publishers[shot.key].put(shot.frame)
                 tally.note(shot)
@@ -440,7 +440,7 @@ def stranger_at(endpoint: str) -> zenoh.Session:
     return zenoh.open(config)
 
 
-def _publishers(link: zenoh.Session, storm: Storm) -> dict[str, zenoh.Publisher]:
+def _publishers(link: zenoh.Session, storm: Storm) -> dict[str, session.Publisher]:
     """Return a publisher for each key, after all processes have subscribed. Earlier frames would be lost."""
     subscribed = [*storm.acted_on, storm.ghost, *storm.wild]
     found = {key: session.publisher(link, key) for key in (*subscribed, *storm.watched, *storm.odd)}
@@ -468,7 +468,7 @@ def _ticks(endpoint: str, genuine: Genuine) -> Iterator[Iterator[int]]:
         del tokens
 
 
-def _puppet_ticks(inbox: Inbox, commands: dict[str, zenoh.Publisher], genuine: Genuine) -> Iterator[int]:
+def _puppet_ticks(inbox: Inbox, commands: dict[str, session.Publisher], genuine: Genuine) -> Iterator[int]:
     latest = -1
     ended: set[str] = set()
     while len(ended) < len(PUPPETS):

@@ -122,7 +122,7 @@ def bad_frames(topic: str) -> dict[bytes, str]:
     return frames
 
 
-def publishers(link: zenoh.Session) -> dict[str, zenoh.Publisher]:
+def publishers(link: zenoh.Session) -> dict[str, session.Publisher]:
     """Return a publisher for each key, once all subscribers match; an earlier put would be lost."""
     found = {key: session.publisher(link, key) for key in (*TRUSTED.values(), *WATCHED, GHOST, OTHER)}
     heard: set[str] = set()
@@ -137,7 +137,7 @@ def mark(heard: set[str], key: str, matching: bool) -> None:
         heard.add(key)
 
 
-def volley(stranger: Mapping[str, zenoh.Publisher], nonsense: Mapping[str, Mapping[bytes, str]]) -> None:
+def volley(stranger: Mapping[str, session.Publisher], nonsense: Mapping[str, Mapping[bytes, str]]) -> None:
     for key, frames in nonsense.items():
         for frame in frames:
             stranger[key].put(frame)

@@ -76,6 +76,7 @@ WORSE: dict[str, Callable[[Judged], Judged]] = {
     "position": lambda one: one._replace(accuracy=0.001),
     "heading": lambda one: one._replace(headings=tuple([(i, whose, 1e-4) for i, whose, _ in one.headings])),
     "early consistency": lambda one: with_p_value(one, 0.005),
+    "constant errors": lambda one: one._replace(fit=one.fit._replace(constants=one.fit.constants + 5.0)),
 }
 
 

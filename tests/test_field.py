@@ -73,9 +73,11 @@ def beacon(*more: str) -> Iterator[str]:
 
 
 @contextmanager
-def pair(out: Path, *more: str | Path, protocol: str = "tcp") -> Iterator[dict[str, TandemProcess]]:
-    """Yield both robots of paper-1's geometry, running."""
-    (out / "field.toml").write_text(ASSURED)
+def pair(
+    out: Path, *more: str | Path, protocol: str = "tcp", text: str = ASSURED
+) -> Iterator[dict[str, TandemProcess]]:
+    """Yield both robots of paper-1's geometry, running the scenario `text`."""
+    (out / "field.toml").write_text(text)
     endpoint = free_endpoint(protocol)
     with beacon() as air:
 

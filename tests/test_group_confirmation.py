@@ -36,11 +36,19 @@ from protocol.messages import Localised, Report, Undecided
 from protocol.motion import Covariance, Pose
 from tests.groups import random_table, table_of, with_value
 from tests.missions import kept
+from tests.series import series
 from tests.test_group_noise import TURNED
 from tests.test_group_runs import audited
 from world.scenario import Scenario
 
 SHIFTED = {"kind": "shift", "part": "all", "size": 0.3}
+
+FALSE_ANCHORS = [
+    (4, 533471434, "anchor/r3", -1.0),
+    (5, 467805398, "anchor/r3", -1.0),
+    (5, 1802622223, "anchor/r1", -0.3),
+]
+"""Groups in which the ranges of one robot to its anchor are false: robots, seed, link, and by how many m."""
 
 WRONG = 21
 """The seed of a group in which r1, with the attack TURNED, misleads r2 in its only meeting until tick 200."""
@@ -229,6 +237,23 @@ def test_a_robot_compares_its_meetings_once_more_before_it_gives_up() -> None:
 
     assert decided(math.inf).robot_verdict is None
     assert decided(0.0).robot_verdict == after.robot_verdict
+
+
+@pytest.mark.parametrize("case", series(FALSE_ANCHORS, 1))
+def test_a_robot_whose_ranges_need_large_constant_errors_claims_no_pose(
+    case: tuple[int, int, str, float],
+) -> None:
+    """It explained its false ranges with biases of up to 14 sigmas, and claimed a pose up to 0.83 m off."""
+    robots, seed, link, by = case
+    noise = {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0}
+    table = random_table(seed, {"tolerates": 1, "accuracy": 0.3, "noise": noise}, robots=robots)
+    attacked = {"model": "attacked", "options": {"link": link, "by": by}}
+    table |= {"max_ticks": 1500, "world": {"range": attacked}}
+    run = run_mission(validate(table, "group.toml").seeded(None))
+    assert run.end is not None
+    assert run.end.outcome == "undecided"
+    claims = {robot for robot, verdict in run.verdicts().items() if isinstance(verdict, Localised)}
+    assert claims == {robot for robot in run.robots if robot not in link}
 
 
 @pytest.mark.long

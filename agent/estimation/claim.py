@@ -16,7 +16,12 @@ from agent.estimation.elementary import eigh
 from agent.estimation.fit import deviation
 from agent.estimation.gaussian.claim_parts import disagreement
 from agent.estimation.gaussian.claim_rivals import WRONG_SIGMAS
-from agent.estimation.gaussian.consistency import CLAIM_P_VALUE, EARLY_CLAIM_P_VALUE, FINISHED
+from agent.estimation.gaussian.consistency import (
+    CLAIM_P_VALUE,
+    EARLY_CLAIM_P_VALUE,
+    FINISHED,
+    constant_errors_p_value,
+)
 from agent.estimation.gaussian.evidence import mutual_evidence
 from agent.estimation.gaussian.joint_claims import DISPLACED_SIGMAS, open_position
 from agent.estimation.gaussian.noise_level import INLIER
@@ -239,6 +244,18 @@ def profiles(judged: Judged) -> str:
     return found.reason("--noise {}" if recorded else 'noise = "{}"')
 
 
+@condition(*EVERYBODY, last=True)
+def constant_errors(judged: Judged) -> str:
+    """The learned constant errors are not too large for what was told: p is at least {CLAIM_P_VALUE:g}.
+
+    A fit explains false ranges by such errors, and its residuals show hardly anything of them.
+    """
+    p_value = constant_errors_p_value(judged.fit)
+    if p_value >= CLAIM_P_VALUE:
+        return ""
+    return f"the fit needs larger constant errors than were told: p = {p_value:.2g}"
+
+
 @condition("assured", "finder", "unanchored", "team", last=True)
 def rivals(judged: Judged) -> str:
     """Poses {WRONG_SIGMAS:g} sigmas away are at most 1 - `confidence` times as likely.
@@ -292,6 +309,7 @@ CONDITIONS = (
     evidence,
     early_consistency,
     profiles,
+    constant_errors,
     parts,
     parts_before,
     rivals,

@@ -10,6 +10,7 @@ import zenoh
 from protocol.messages import RobotConfig
 from protocol.network import keys, session
 from protocol.network.inbox import Arrival, Inbox
+from protocol.network.watchdog import CALL
 
 
 class AgentLink:
@@ -30,7 +31,7 @@ class AgentLink:
         me, run = self._id, self._run
         self._session = link
         self._command = session.publisher(link, keys.command(run, me))
-        self._reports: dict[str, zenoh.Publisher] = {}
+        self._reports: dict[str, session.Publisher] = {}
         self._estimate = session.publisher(link, keys.estimate(run, me))
         session.on_matching(self._estimate, self._want_estimate)
         session.subscribe_directly(link, keys.observation(run, me), self._inbox, "observation")
@@ -50,7 +51,8 @@ class AgentLink:
     def appear(self) -> None:
         """Withdraw the liveliness token and declare it again, so that the world sees the robot reappear."""
         gone: Any = self._token  # undeclare() is untyped
-        gone.undeclare()
+        with CALL:
+            gone.undeclare()
         self._token = self._show_alive()
 
     def command(self, frame: bytes) -> None:

@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import os
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
+from signal import SIGKILL
 
 from compose.errors import FAILED, STOPPED_STATUS, UserError
 from compose.launch.signals import stop_with_launcher
@@ -16,6 +19,7 @@ from protocol.network import session
 from protocol.network.clock import Clock
 from protocol.network.endpoints import Endpoints
 from protocol.network.inbox import Inbox, Interrupted
+from protocol.network.watchdog import watch
 
 RELISTEN_S = 5.0
 """s to wait for the port of a participant that has just been killed to become free."""
@@ -35,10 +39,14 @@ def participate(
     raises an exception. A process that is `launched` also stops with its launcher. An exception of `failures`
     is printed, and the status is FAILED; after a signal it is STOPPED_STATUS. Raises UserError if a flag
     cannot be followed.
+
+    If Zenoh does not return from a call, the process ends: one that is `launched` as if it had been killed,
+    from which its launcher restarts a robot's agent.
     """
     inbox = Inbox(owner, clock)
     if launched:
         stop_with_launcher(inbox)
+    watch(owner, partial(os.kill, os.getpid(), SIGKILL) if launched else partial(os._exit, FAILED))
     try:
         return body(inbox)
     except session.CannotListen as error:

@@ -23,6 +23,7 @@ from protocol.network import keys
 from protocol.network.endpoints import Endpoints, zenoh_config
 from protocol.network.inbox import COMPLAINT, NO_ARRIVAL, Arrival, Inbox, Line, LineClosed, Topic
 from protocol.network.keys import Key
+from protocol.network.watchdog import CALL, OPENING
 from protocol.wire import encode
 
 CLOSE_TIMEOUT_S = 2.0
@@ -88,7 +89,8 @@ def open_router(endpoints: Endpoints, wait: float = 0.0, *, closes: bool = True)
     _check_limits()
     for left in range(round(wait / LISTEN_AGAIN_S), -1, -1):
         try:
-            session = zenoh.open(zenoh_config(endpoints))
+            with OPENING:
+                session = zenoh.open(zenoh_config(endpoints))
             break
         except zenoh.ZError as error:
             taken = "in use" in str(error)
@@ -114,7 +116,8 @@ def open_client(endpoints: Endpoints, unanswered: Callable[[], None]) -> Iterato
     _check_limits()
     for attempt in count():
         try:
-            session = zenoh.open(zenoh_config(endpoints, first=attempt))
+            with OPENING:
+                session = zenoh.open(zenoh_config(endpoints, first=attempt))
             break
         except zenoh.ZError:
             unanswered()
@@ -131,7 +134,8 @@ def open_session(
 
 def subscribe(session: zenoh.Session, key: str, inbox: Inbox, topic: Topic) -> None:
     """Put all messages on `key` into `inbox`. Zenoh hands each of them to a thread of the subscriber."""
-    session.declare_subscriber(key, lambda sample: deliver(sample, inbox, topic))
+    with CALL:
+        session.declare_subscriber(key, lambda sample: deliver(sample, inbox, topic))
 
 
 def _at_once(hand_over: Callable[[T], None]) -> zenoh.handlers.Callback[T]:
@@ -183,11 +187,13 @@ class _Subscription(Line):
         self._key = key
         self._inbox = inbox
         self._topic: Topic = topic
-        self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(LINE_FRAMES))
+        with CALL:
+            self._subscriber = session.declare_subscriber(key, zenoh.handlers.RingChannel(LINE_FRAMES))
 
     def receive(self, *, wait: bool) -> Arrival | None:
         try:
-            sample = self._subscriber.recv() if wait else self._subscriber.try_recv()
+            with CALL:
+                sample = self._subscriber.recv() if wait else self._subscriber.try_recv()
         except zenoh.ZError:
             raise LineClosed from None
         if sample is None or (sample.attachment is not None and sample.attachment.to_bytes() == WAKE):
@@ -207,19 +213,22 @@ def watch_liveliness(session: zenoh.Session, key: str, inbox: Inbox) -> None:
     def hand_over(sample: zenoh.Sample) -> None:
         deliver(sample, inbox, "alive" if sample.kind == zenoh.SampleKind.PUT else "gone")
 
-    session.liveliness().declare_subscriber(key, _at_once(hand_over), history=True)
+    with CALL:
+        session.liveliness().declare_subscriber(key, _at_once(hand_over), history=True)
 
 
 def alive(session: zenoh.Session, key: str, timeout: float) -> list[Key]:
     """Return the keys of the current liveliness tokens on `key`, within `timeout` s."""
-    replies = session.liveliness().get(key, timeout=timeout)
-    shown = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
+    with CALL:
+        replies = session.liveliness().get(key, timeout=timeout)
+        shown = {str(reply.ok.key_expr) for reply in replies if reply.ok is not None}
     return [source for one in sorted(shown) if (source := keys.parse(one)) is not None]
 
 
 def linked(session: zenoh.Session) -> bool:
     """Return whether the session has a link to a router."""
-    return bool(session.info.routers_zid())
+    with CALL:
+        return bool(session.info.routers_zid())
 
 
 class LinkLost(Exception):
@@ -298,17 +307,20 @@ def ask(
     refusal: str | None = None
     strange: bytes | None = None
     everyone, everything = zenoh.QueryTarget.ALL, zenoh.ConsolidationMode.NONE
-    replies = session.get(key, timeout=timeout, payload=process, target=everyone, consolidation=everything)
-    for reply in replies:
-        if reply.ok is not None and str(reply.ok.key_expr) == key:
-            frame = reply.ok.payload.to_bytes()
-            if is_understood(frame):
-                return frame
-            strange = strange or frame
-        elif (
-            reply.err is not None and reply.err.encoding == REFUSAL
-        ):  # Zenoh's own errors, such as a timeout, have another encoding
-            refusal = refusal or reply.err.payload.to_bytes()[:COMPLAINT].decode(errors="replace")
+    with CALL:
+        replies = session.get(
+            key, timeout=timeout, payload=process, target=everyone, consolidation=everything
+        )
+        for reply in replies:
+            if reply.ok is not None and str(reply.ok.key_expr) == key:
+                frame = reply.ok.payload.to_bytes()
+                if is_understood(frame):
+                    return frame
+                strange = strange or frame
+            elif (
+                reply.err is not None and reply.err.encoding == REFUSAL
+            ):  # Zenoh's own errors, such as a timeout, have another encoding
+                refusal = refusal or reply.err.payload.to_bytes()[:COMPLAINT].decode(errors="replace")
     return refusal if refusal is not None else strange
 
 
@@ -334,27 +346,44 @@ def answer(session: zenoh.Session, key: str, reply: Callable[[str, bytes], Messa
         else:
             query.reply(query.key_expr, encode(answered), encoding=MSGPACK)
 
-    session.declare_queryable(key, hand_over)
+    with CALL:
+        session.declare_queryable(key, hand_over)
 
 
 def show_alive(session: zenoh.Session, key: str) -> zenoh.LivelinessToken:
     """Declare a liveliness token on `key`, which lasts as long as the session. Declare subscribers before."""
-    return session.liveliness().declare_token(key)
+    with CALL:
+        return session.liveliness().declare_token(key)
 
 
-def on_matching(publisher: zenoh.Publisher, tell: Callable[[bool], None]) -> None:
+class Publisher:
+    """A publisher of frames on one key. It neither batches nor drops messages."""
+
+    def __init__(self, declared: zenoh.Publisher) -> None:
+        self.declared = declared
+
+    def put(self, frame: bytes, **options: Any) -> None:
+        """Send a frame, with the `options` of Zenoh."""
+        with CALL:
+            self.declared.put(frame, **options)
+
+
+def publisher(session: zenoh.Session, key: str) -> Publisher:
+    """Return a publisher of frames on `key`."""
+    with CALL:
+        declared = session.declare_publisher(
+            key,
+            encoding=MSGPACK,
+            congestion_control=zenoh.CongestionControl.BLOCK,
+            express=True,
+        )
+    return Publisher(declared)
+
+
+def on_matching(publisher: Publisher, tell: Callable[[bool], None]) -> None:
     """Call `tell`, now and on every change, with whether `publisher` has a subscriber."""
     handler: zenoh.handlers.Callback[zenoh.MatchingStatus] = _at_once(lambda status: tell(status.matching))
-    publisher.declare_matching_listener(handler)
-    status: Any = publisher.matching_status  # its declared type, bool, is wrong
+    with CALL:
+        publisher.declared.declare_matching_listener(handler)
+        status: Any = publisher.declared.matching_status  # its declared type, bool, is wrong
     tell(status.matching)
-
-
-def publisher(session: zenoh.Session, key: str) -> zenoh.Publisher:
-    """Return a publisher of frames on `key`. It neither batches nor drops messages."""
-    return session.declare_publisher(
-        key,
-        encoding=MSGPACK,
-        congestion_control=zenoh.CongestionControl.BLOCK,
-        express=True,
-    )

@@ -10,6 +10,7 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 
+from agent.estimation.elementary import product
 from agent.estimation.fit import Fit
 from agent.estimation.gaussian.evidence import own_fit
 from agent.estimation.gaussian.joint_ranges import JointMeasurements
@@ -106,6 +107,25 @@ def consistency_test(fitted: Fit, pair: JointMeasurements, robot: int) -> Incons
         tests.append(Inconsistent(what, score, math.erfc(score / math.sqrt(2.0))))
     least = min(tests, key=lambda one: one.p_value)
     return replace(least, p_value=min(least.p_value, fisher([one.p_value for one in tests])))
+
+
+def constant_errors_p_value(fit: Fit) -> float:
+    """Return the probability of constant errors at least as large as those of a fit, under their priors.
+
+    What a fit learns of them has the covariance (I - P) (I + (L - 1) P), in their sigmas: P is what is left
+    of their prior covariance I, and L the noise level of the white errors, which is no reason for larger
+    constant ones. The sum of their squares is compared with a chi-square of the same mean and variance
+    (Satterthwaite 1946), so those of which the ranges tell little do not count. Among the chi-square of
+    hundreds of ranges, these few would hardly be seen.
+    """
+    constants, size = fit.constants, fit.start.poses.size
+    left = fit.linear.step.inverse[size : size + len(constants), size : size + len(constants)]
+    one = np.eye(len(constants))
+    learned = product(one - left, one + max(fit.level - 1.0, 0.0) * left)
+    mean, square = float(np.trace(learned)), float(np.sum(np.square(learned)))
+    if not mean > 0.0:
+        return 1.0
+    return chi2_p_value(float(np.sum(np.square(constants))) * mean / square, mean * mean / square)
 
 
 def fisher(p_values: Sequence[float]) -> float:
@@ -244,12 +264,12 @@ FRACTION_TERMS = 500
 """The maximum number of terms of the fraction; it needs about the root of the degrees of freedom."""
 
 
-def chi2_p_value(chi2: float, free: int) -> float:
+def chi2_p_value(chi2: float, free: float) -> float:
     """Return the probability of a larger chi-square with `free` degrees of freedom (Wilson and Hilferty)."""
     return 0.5 * math.erfc(_normal(chi2, free) / math.sqrt(2.0))
 
 
-def _normal(chi2: float, free: int) -> float:
+def _normal(chi2: float, free: float) -> float:
     """Return a chi-square with `free` degrees of freedom as a standard normal variable (Wilson and Hilferty).
 
     Rounding may make the chi-square of a fit that has not reached its minimum negative (see
