@@ -149,6 +149,26 @@ def test_the_paper_planner_keeps_the_safety_distance_or_gives_up() -> None:
     assert "localised" in outcomes
 
 
+def test_b_of_the_paper_planner_does_not_move_before_it_knows_that_a_stands() -> None:
+    """Where reports overtook each other, both drove in one tick, and came 0.26 m near."""
+    mission = {"sensing_range": 3.0, "period": 1.0, "max_speed": 1.0, "max_turn_rate": math.pi}
+    starts = (
+        ("a", 0.0, [1.6822396427967417, 0.0, 1.5135455426314672]),
+        ("b", 10.0, [7.5343756820837, 0.0003903185466716973, 4.829704187461034]),
+    )
+    table = {
+        "name": "late",
+        "planner": {"name": "paper"},
+        "mission": mission | {"safety_distance": 0.3},
+        "fault": [{"reorder": 0.5}],
+        "robot": [{"id": name, "anchor": [x, 0.0], "start": start} for name, x, start in starts],
+        "max_ticks": 60,
+    }
+    least = nearest(run_mission(validate(table, "late.toml").seeded(1)))
+    assert least is not None
+    assert least >= 0.3 - 1e-9
+
+
 def test_a_safety_distance_above_that_at_first_contact_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "safe.toml"
     text = (Path("compose/scenario/shipped") / "random.toml").read_text()

@@ -143,6 +143,8 @@ def as_published(state: RobotState, planned: PlannedLast) -> RobotState:
         return state
     if moved:
         return state.undecided(estimate.failure)
+    if state.config.mission.safety_distance and state.peer_state.state not in PEER_RESTS:
+        return state  # a still drives, and its report of that is late
     moving = last_manoeuvre(state, estimate, planned)
     return moving if moving is not None else state.undecided("no manoeuvre keeps the safety distance")
 
