@@ -26,6 +26,9 @@ FITTED = 3
 ADDED_CURVATURE = 1e-9
 """The fraction of a fit's curvature that is added to it, so that a step stays within what is determined."""
 
+NEAR_DOUBLE_ROOT = 1e-6
+"""The part of ADDED_CURVATURE near a double root."""
+
 CLOSEST = 1e-12
 """The fraction of D below which a range is weighted like a range of that length."""
 
@@ -184,7 +187,6 @@ def weigh_placements(
 
     `floor` is the largest error (m) of a predicted range from rounding, that of phase 1 included.
     """
-    left: list[Placement] = []
     ranged: list[tuple[Positions, float]] = []
     undetected: list[Positions] = []
     for seen in pair_observations:
@@ -193,8 +195,26 @@ def weigh_placements(
             undetected.append((a.x, a.y, b.x, b.y))
         else:
             ranged.append(((a.x, a.y, b.x, b.y), rho))
-    for solution in solutions:
-        placement = _polished_placement(solution, ranged) if len(ranged) > 2 else solution
+    if len(ranged) <= 2:
+        return _consistent(solutions, ranged, undetected, sensing_range, floor)
+    every = tuple(solutions)
+    for near_double_root in (False, True):
+        polished = [_polished_placement(one, ranged, near_double_root) for one in every]
+        if left := _consistent(polished, ranged, undetected, sensing_range, floor):
+            break
+    return left
+
+
+def _consistent(
+    solutions: Iterable[Placement],
+    ranged: Sequence[tuple[Positions, float]],
+    undetected: Sequence[Positions],
+    sensing_range: float,
+    floor: float,
+) -> tuple[Placement, ...]:
+    """Return the different ones of `solutions` that explain all ranges, and all ticks without one."""
+    left: list[Placement] = []
+    for placement in solutions:
         same = same_turn(math.hypot(placement.x, placement.y) + sensing_range)
         if (
             _explains_ranges(placement, ranged, floor)
@@ -286,14 +306,18 @@ def _slopes(
             yield uy * (there.x - tx) - ux * (there.y - ty), uy * tx - ux * ty, ux, uy
 
 
-def _polished_placement(placement: Placement, measured: Sequence[tuple[Positions, float]]) -> Placement:
+def _polished_placement(
+    placement: Placement, measured: Sequence[tuple[Positions, float]], near_double_root: bool
+) -> Placement:
     """Return the placement near `placement` that fits all ranges best, with M1 at D from M2 (Gauss-Newton).
 
     The fit uses squared ranges, weighted so that a residual is an error of the range itself. Otherwise a
     short range would have no influence beside longer ones.
 
     The unknowns are phi and the bearing psi of M1 in <b(M2)>. Two ranges determine them exactly. More ranges
-    separate solutions that eq. (7) alone yields as a double root.
+    separate solutions that eq. (7) alone yields as a double root. Near one, two ranges curve the fit by 1e-14
+    of what a third one does, and a step may lead too far: with `near_double_root`, less curvature is added,
+    and steps are halved.
     """
     distance = math.hypot(placement.x, placement.y)
     closest = CLOSEST * distance
@@ -303,7 +327,8 @@ def _polished_placement(placement: Placement, measured: Sequence[tuple[Positions
         for weight in (0.5 / max(rho, closest),)
     ]
     phi, psi = placement.phi, math.atan2(placement.y, placement.x)
-    best, fitted = math.inf, placement
+    best, fitted, to_phi, to_psi = math.inf, placement, 0.0, 0.0
+    added = 1.0 + ADDED_CURVATURE * (NEAR_DOUBLE_ROOT if near_double_root else 1.0)
     for _ in range(POLISHING_STEPS):
         c, s = math.cos(phi), math.sin(phi)
         tx, ty = distance * math.cos(psi), distance * math.sin(psi)
@@ -320,13 +345,17 @@ def _polished_placement(placement: Placement, measured: Sequence[tuple[Positions
             qq += by_psi * by_psi
             gp += by_phi * error
             gq += by_psi * error
-        if cost >= best:
+        if cost >= best and not near_double_root:
             break
+        if cost >= best:
+            to_phi, to_psi = 0.5 * to_phi, 0.5 * to_psi
+            phi, psi = phi + to_phi, psi + to_psi
+            continue
         best, fitted = cost, Placement(wrap(phi), tx, ty)
-        pp, qq = pp * (1.0 + ADDED_CURVATURE), qq * (1.0 + ADDED_CURVATURE)
+        pp, qq = pp * added, qq * added
         determinant = pp * qq - pq * pq
         if determinant == 0.0:
             break
-        phi -= (qq * gp - pq * gq) / determinant
-        psi -= (pp * gq - pq * gp) / determinant
+        to_phi, to_psi = (qq * gp - pq * gq) / determinant, (pp * gq - pq * gp) / determinant
+        phi, psi = phi - to_phi, psi - to_psi
     return fitted
