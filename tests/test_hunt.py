@@ -307,6 +307,16 @@ RARE = [
     cell("mismatch-uwb", 3),
     cell("noise", 8) | {"seed": 2},
     changed("room", world={"noise": {"outliers": 0.3, "outlier_bias": [0.5, 2.0]}}) | {"max_ticks": 60},
+    changed(
+        "random-group",
+        mission={
+            "tolerates": 1,
+            "accuracy": 0.3,
+            "noise": {"anchor_sigma": 0.05, "mutual_sigma": 0.05, "gyro_bias": 0.0},
+        },
+        world={"range": {"model": "attacked", "options": {"link": "anchor/r3", "by": -1.0}}},
+    )
+    | {"seed": 533471434},
 ]
 """Inputs with what the sweeps of their scenarios do not have."""
 SOURCES = ("random-group", "random", "noisy", "room", "relative")
