@@ -313,7 +313,7 @@ def test_reports_are_received_despite_a_drop_out(tmp_path: Path) -> None:
 def test_who_is_in_range_follows_from_the_distance_and_not_from_what_is_measured() -> None:
     scenario = near("anchor_sigma = 0.1\nmutual_sigma = 0.1")
     origins, reach = release(scenario).truth.origins, scenario.mission.sensing_range
-    rim, beyond = (Pose(rho, 0.0, 0.0) for rho in (reach, math.nextafter(reach, 4.0)))
+    rim, beyond = (Pose(rho, 0.0, 0.0) for rho in (reach, reach * (1.0 + 1e-9)))
     for tick in range(100):
         on_it = Truth(tick, (rim, Pose(0.0, 0.0, 0.0)), origins)
         off_it = Truth(tick, (beyond, Pose(0.0, 0.0, 0.0)), origins)

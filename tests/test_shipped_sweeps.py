@@ -206,7 +206,7 @@ def test_labels_that_are_numbers_make_a_curve(labels: str, curve: bool, tmp_path
     median = axes.lines[0]
     assert median.get_linestyle() == ("-" if curve else "None")
     assert np.asarray(median.get_xdata()).tolist() == ([0.0, 0.5] if curve else [0.0, 1.0])
-    assert axes.get_legend_handles_labels()[1] == ["median", "95 %"]
+    assert axes.get_legend_handles_labels()[1] == ["median", "95 % quantile"]
     found = [results.figures[cell.index] for cell in results.cells]
     assert [one.estimate for one in points] == [
         *(ticks for one in found for ticks in (one.ticks_p50, one.ticks_p95)),
