@@ -32,7 +32,10 @@ WAITS = """
 for _ in range(100):
     with watchdog.CALL: time.sleep(0.02)
 """
-WAITS_ONCE = "with watchdog.CALL: time.sleep(0.3)"
+WAITS_ONCE = """
+watchdog.CALL.longest_s = 1.5
+with watchdog.CALL: time.sleep(1.0)
+"""
 PLANNER = "tests.own_planners:Hanging"
 
 
@@ -65,7 +68,7 @@ def test_the_time_for_which_a_process_is_suspended_does_not_count() -> None:
     process = watched(WAITS_ONCE)
     os.kill(process.pid, SIGSTOP)
     with pytest.raises(subprocess.TimeoutExpired):
-        process.wait(0.6)
+        process.wait(2.0)
     os.kill(process.pid, SIGCONT)
     assert process.communicate(timeout=20.0) == ("", "")
     assert process.returncode == 0
