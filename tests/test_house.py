@@ -31,7 +31,7 @@ BELOW = {
 }
 """The packages of the project that each package may import."""
 
-BUDGETS = {"protocol": 4_928, "agent": 19_275, "world": 4_621, "compose": 31_329, "tandem": 1_981}
+BUDGETS = {"protocol": 4_928, "agent": 19_276, "world": 4_621, "compose": 31_329, "tandem": 1_981}
 """The largest number of lines of Python and C of each package. Raising one needs a reason in the commit."""
 
 SHELL = {

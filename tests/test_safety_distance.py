@@ -169,6 +169,26 @@ def test_b_of_the_paper_planner_does_not_move_before_it_knows_that_a_stands() ->
     assert least >= 0.3 - 1e-9
 
 
+def test_a_begins_phase_3_beside_b_that_has_its_result() -> None:
+    """By late reports, a never knew that b stood, and waited to the end."""
+    a = [8.830949933827478, 1.7361806548376397, -1.3766703917682876]
+    table = {
+        "name": "late",
+        "mission": {
+            "sensing_range": 9.0,
+            "period": 1.0,
+            "max_speed": 1.0,
+            "max_turn_rate": math.pi,
+            "safety_distance": 0.8,
+        },
+        "fault": [{"delay": [1, 6]}],
+        "robot": [{"id": "a", "anchor": [0.0, 0.0], "start": a}, {"id": "b", "anchor": [10.0, 0.0]}],
+    }
+    run = run_mission(validate(table, "late.toml").seeded(1377329033))
+    assert outcome(run) == "localised"
+    assert run.length < 60
+
+
 def test_a_safety_distance_above_that_at_first_contact_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "safe.toml"
     text = (Path("compose/scenario/shipped") / "random.toml").read_text()

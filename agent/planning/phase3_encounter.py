@@ -53,12 +53,13 @@ def begun(state: RobotState) -> RobotState:
 def _may_drive_straight(state: RobotState) -> bool:
     """Return whether a knows that b stands, and is far enough from b to drive straight on.
 
-    Once b stands, it does so until a rests; a report that says so may be late.
+    Once b stands, it does so until a rests, or has its result; a report that says so may be late.
     """
     if not state.mutual or state.mutual[-1].tick != state.tick:
         return False
     peer = state.peer_state
-    stands = peer.peer.through == state.tick or peer.state == tasks.Standing.name
+    rests = peer.state == tasks.Standing.name or isinstance(peer.verdict, Localised)
+    stands = rests or peer.peer.through == state.tick
     return stands and step_length("peer", state.mutual[-1].range, state.config.mission) >= SHORTEST_STEP
 
 
