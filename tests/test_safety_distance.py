@@ -29,6 +29,7 @@ from tests.series import series
 from world.scenario import Scenario
 
 SAFE = 1.0
+SECTION_IV = {"sensing_range": 3.0, "period": 1.0, "max_speed": 1.0, "max_turn_rate": math.pi}
 NEAR = 75
 """The seed of a random mission in which b's last manoeuvre ends 0.75 m from a without a safety distance."""
 
@@ -119,13 +120,7 @@ def test_none_comes_nearer_however_many_reports_are_lost_or_late(seed: int, loss
 def test_robots_that_begin_in_range_of_each_other_come_no_nearer_than_that(seed: int) -> None:
     table = {
         "name": "near",
-        "mission": {
-            "sensing_range": 3.0,
-            "period": 1.0,
-            "max_speed": 1.0,
-            "max_turn_rate": math.pi,
-            "safety_distance": SAFE,
-        },
+        "mission": SECTION_IV | {"safety_distance": SAFE},
         "robot": [{"id": "a", "anchor": [0.0, 0.0]}, {"id": "b", "anchor": [3.0, 0.0]}],
         "max_ticks": 60,
     }
@@ -150,8 +145,7 @@ def test_the_paper_planner_keeps_the_safety_distance_or_gives_up() -> None:
 
 
 def test_b_of_the_paper_planner_does_not_move_before_it_knows_that_a_stands() -> None:
-    """Where reports overtook each other, both drove in one tick, and came 0.26 m near."""
-    mission = {"sensing_range": 3.0, "period": 1.0, "max_speed": 1.0, "max_turn_rate": math.pi}
+    """A mission in which reports overtook each other: both drove in one tick, and came 0.26 m near."""
     starts = (
         ("a", 0.0, [1.6822396427967417, 0.0, 1.5135455426314672]),
         ("b", 10.0, [7.5343756820837, 0.0003903185466716973, 4.829704187461034]),
@@ -159,7 +153,7 @@ def test_b_of_the_paper_planner_does_not_move_before_it_knows_that_a_stands() ->
     table = {
         "name": "late",
         "planner": {"name": "paper"},
-        "mission": mission | {"safety_distance": 0.3},
+        "mission": SECTION_IV | {"safety_distance": 0.3},
         "fault": [{"reorder": 0.5}],
         "robot": [{"id": name, "anchor": [x, 0.0], "start": start} for name, x, start in starts],
         "max_ticks": 60,
@@ -174,13 +168,7 @@ def test_a_begins_phase_3_beside_b_that_has_its_result() -> None:
     a = [8.830949933827478, 1.7361806548376397, -1.3766703917682876]
     table = {
         "name": "late",
-        "mission": {
-            "sensing_range": 9.0,
-            "period": 1.0,
-            "max_speed": 1.0,
-            "max_turn_rate": math.pi,
-            "safety_distance": 0.8,
-        },
+        "mission": SECTION_IV | {"sensing_range": 9.0, "safety_distance": 0.8},
         "fault": [{"delay": [1, 6]}],
         "robot": [{"id": "a", "anchor": [0.0, 0.0], "start": a}, {"id": "b", "anchor": [10.0, 0.0]}],
     }
@@ -351,14 +339,7 @@ def test_two_robots_that_begin_near_each_other_are_localised(name: str) -> None:
     safety, x, a, b, noise = NEAR_STARTS[name]
     table = {
         "name": "near",
-        "mission": {
-            "sensing_range": 3.0,
-            "period": 1.0,
-            "max_speed": 1.0,
-            "max_turn_rate": math.pi,
-            "safety_distance": safety,
-            **noise,
-        },
+        "mission": SECTION_IV | {"safety_distance": safety, **noise},
         "robot": [
             {"id": "a", "anchor": [0.0, 0.0], "start": a},
             {"id": "b", "anchor": [x, 0.0], "start": b},

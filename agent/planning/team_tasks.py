@@ -313,19 +313,18 @@ def _to_anchor(state: TeamState) -> Controls | None:
     If it has never ranged that anchor, it goes to where it was nearest to a robot that has. None if it has no
     such anchor, or is in range of it, or there.
     """
-    names, robots = [one.id for one in state.team.anchors], state.team.robots
+    names, logs, count = [one.id for one in state.team.anchors], state.log.logs, len(state.team.robots)
     located = state.following.part.robots if state.following.part is not None else ()
     for name in [one for one in state.wanted if one not in located]:
         anchor = names.index(name)
-        of_robots = [state.nearest[k] for k in range(len(robots)) if _has_ranged(state, k, anchor)]
-        near = min([state.nearest[len(robots) + anchor], *of_robots], key=lambda one: one.range == math.inf)
+        near = state.nearest[count + anchor]
+        if near.range == math.inf:
+            met = [k for k in range(count) if state.nearest[k].range < math.inf]
+            ranged = [k for k in met if any(one.to == anchor for entry in logs[k] for one in entry.anchors)]
+            near = state.nearest[ranged[0]] if ranged else near
         if near.latest < state.tick and near.range < math.inf:
             return towards((near.place.x, near.place.y), state.odometry, state.config.mission, ARRIVED)
     return None
-
-
-def _has_ranged(state: TeamState, robot: int, anchor: int) -> bool:
-    return any(one.to == anchor for entry in state.log.logs[robot] for one in entry.anchors)
 
 
 def _seen(state: TeamState) -> list[AmongBeacons]:

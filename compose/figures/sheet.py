@@ -30,7 +30,7 @@ PAD = 0.04
 TITLE = 110
 """The maximum number of characters of a line of a title, which fit in the width PAGE."""
 UNPRINTED = re.compile(r"\\[a-z,]+|[$_{}]")
-"""What is not printed of symbols in a title, or as another character."""
+"""The characters of a symbol in a title that are not printed, or as one other character."""
 PANELS, ACROSS = 6, 3
 """The maximum number of panels of a series, in total and in a row."""
 LONE = 3.0
